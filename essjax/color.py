@@ -1,0 +1,92 @@
+"""Colour transforms, each with its inverse. Inputs ``[..., 3]`` linear HDR unless said otherwise."""
+
+import jax.numpy as jnp
+
+from essjax.typing import Array, Color, Image, Plane
+
+ALBEDO_FLOOR = 0.04
+"""Smallest divisor of a demodulation: below it noise in dark materials would be amplified."""
+
+
+def demodulation_albedo(
+    base_color: Color, background: Array, metallic: Plane | None = None, specular: Plane | None = None
+) -> Color:
+    """What shading is divided by before a warp and multiplied with after it (ExtraSS section 4.2).
+
+    ``base_color + 0.08 * specular * (1 - metallic)``, at least ``ALBEDO_FLOOR``; 1 on the background, so that sky is
+    neither demodulated nor modulated.
+
+    Args:
+      base_color: ``[..., H, W, 3]`` in [0, 1].
+      background: bool ``[..., H, W, 1]``, true where nothing was hit.
+      metallic: ``[..., H, W, 1]`` in [0, 1]; 0 if None.
+      specular: ``[..., H, W, 1]`` in [0, 1]; 0.5 if None.
+    """
+    reflectance = 0.08 * (0.5 if specular is None else specular) * (1.0 if metallic is None else 1.0 - metallic)
+    return jnp.where(background, 1.0, jnp.maximum(base_color + reflectance, ALBEDO_FLOOR))
+
+
+def demodulate(color: Color, albedo: Color) -> Color:
+    """Shading without texture: ``color / albedo``; ``albedo`` from ``demodulation_albedo`` (> 0)."""
+    return color / albedo
+
+
+def modulate(shading: Color, albedo: Color) -> Color:
+    """Inverse of ``demodulate``."""
+    return shading * albedo
+
+
+def log1p(color: Image) -> Image:
+    """log(1 + x) of radiance: what networks see. Negative input counts as 0."""
+    return jnp.log1p(jnp.maximum(color, 0.0))
+
+
+def expm1(encoded: Image) -> Image:
+    """Inverse of ``log1p``; negative values become 0."""
+    return jnp.expm1(jnp.maximum(encoded, 0.0))
+
+
+def reinhard(color: Image) -> Image:
+    """x / (1 + x): [0, inf) to [0, 1). Negative input counts as 0."""
+    color = jnp.maximum(color, 0.0)
+    return color / (1.0 + color)
+
+
+def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:
+    """Inverse of ``reinhard``; values above ``limit`` are clamped so that the result stays finite."""
+    encoded = jnp.clip(encoded, 0.0, limit)
+    return encoded / (1.0 - encoded)
+
+
+def srgb_encode(linear: Image) -> Image:
+    """The sRGB transfer function (IEC 61966-2-1) on [0, 1]; finite gradient at 0."""
+    safe = jnp.maximum(linear, 0.0031308)
+    return jnp.where(linear <= 0.0031308, 12.92 * linear, 1.055 * safe ** (1.0 / 2.4) - 0.055)
+
+
+def srgb_decode(encoded: Image) -> Image:
+    """Inverse of ``srgb_encode``."""
+    safe = jnp.maximum(encoded, 0.04045)
+    return jnp.where(encoded <= 0.04045, encoded / 12.92, ((safe + 0.055) / 1.055) ** 2.4)
+
+
+def display(color: Image) -> Image:
+    """What a viewer sees and what metrics score: ``srgb_encode(reinhard(color))``, in [0, 1)."""
+    return srgb_encode(reinhard(color))
+
+
+def rgb_to_ycocg(rgb: Color) -> Color:
+    """Luma and two chroma differences (Malvar and Sullivan 2003); linear, exactly invertible in reals."""
+    r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    return jnp.stack([0.25 * r + 0.5 * g + 0.25 * b, 0.5 * (r - b), -0.25 * r + 0.5 * g - 0.25 * b], axis=-1)
+
+
+def ycocg_to_rgb(ycocg: Color) -> Color:
+    """Inverse of ``rgb_to_ycocg``."""
+    y, co, cg = ycocg[..., 0], ycocg[..., 1], ycocg[..., 2]
+    return jnp.stack([y + co - cg, y + cg, y - co - cg], axis=-1)
+
+
+def luminance(color: Color) -> Plane:
+    """Rec. 709 luminance ``[..., 1]`` of linear colour."""
+    return color @ jnp.array([[0.2126], [0.7152], [0.0722]], color.dtype)

@@ -1,0 +1,243 @@
+"""The vocabulary: GBuffers, Frame, Sequence, Prediction, and the checks that stand where user data enters.
+
+Shapes are those of one image; any leading axes may stand in front: ``[H, W, C]``, ``[B, H, W, C]``, ``[T, B, H, W, C]``.
+All are frozen pytrees: change a field with ``dataclasses.replace``. ``None`` means the channel does not exist.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from essjax.cameras import Camera
+from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree, Scalar, Vectors
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class GBuffers:
+    """What the rasteriser knows without shading, at the jittered sample positions.
+
+    Attributes:
+      base_color: ``[..., H, W, 3]`` in [0, 1]; 0 on the sky.
+      normal: ``[..., H, W, 3]`` world space, unit length; zero vector where nothing was hit.
+      depth: ``[..., H, W, 1]`` positive view-space z, linear, metres; background +inf.
+      roughness: ``[..., H, W, 1]`` in [0, 1].
+      metallic: ``[..., H, W, 1]`` in [0, 1].
+      specular: ``[..., H, W, 1]`` in [0, 1].
+      world_position: ``[..., H, W, 3]`` metres; 0 on the background.
+      stencil: ``[..., H, W, 1]`` integer object id >= 0; 0 static or none.
+      n_dot_v: ``[..., H, W, 1]`` in [0, 1]: cosine between normal and direction to the camera.
+    """
+
+    base_color: Color
+    normal: Vectors
+    depth: Plane
+    roughness: Plane | None = None
+    metallic: Plane | None = None
+    specular: Plane | None = None
+    world_position: Vectors | None = None
+    stencil: Ids | None = None
+    n_dot_v: Plane | None = None
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Frame:
+    """One frame as a method sees it.
+
+    Attributes:
+      color: ``[..., H, W, 3]`` linear HDR radiance, one jittered sample per pixel; None on extrapolated frames.
+      gbuffers: at the same sample positions.
+      motion: ``[..., H, W, 2]`` (x right, y down) pixels of this resolution, to the previous frame; unjittered,
+        stored at the jittered sample positions.
+      jitter: ``[..., 2]`` (x, y) pixels of this resolution in [-0.5, 0.5): the sample lies at pixel centre + jitter.
+      cut: bool ``[...]``: true where history is not valid (first frame of a shot).
+      exposure: ``[...]`` positive; colour is scene radiance whatever its value.
+      camera: in pixels of this resolution, or None.
+      reactive: ``[..., H, W, 1]`` in [0, 1], 1 = do not trust history here; or None.
+    """
+
+    color: Color | None
+    gbuffers: GBuffers
+    motion: Motion
+    jitter: Jitter
+    cut: Flag
+    exposure: Scalar
+    camera: Camera | None = None
+    reactive: Plane | None = None
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Sequence:
+    """Frames stacked in time, with what they are scored against. Leading axes ``[T, ...]``.
+
+    Attributes:
+      frames: a ``Frame`` whose leaves carry the time axis; colour of *every* frame: on frames that a schedule
+        extrapolates it is a target, and ``rollout.unroll`` takes it away before the method sees the frame.
+      reference: ``[T, ..., s*H, s*W, 3]`` anti-aliased reference, unjittered.
+      valid: ``[T, ..., H, W, 1]`` LR, 1 where the previous position is on screen and showed the same surface; exact,
+        from the renderer. None: ``warp.hole_mask`` estimates it.
+      steady: ``[T, ..., H, W, 1]`` LR, 1 where the shading is known not to move against the surface (no mirror image,
+        no changing shadow); from the renderer only.
+      native: frames at the reference's resolution with a jitter of their own (the input of native TAA); or None.
+    """
+
+    frames: Frame
+    reference: Color
+    valid: Mask | None = None
+    steady: Mask | None = None
+    native: Frame | None = None
+
+    @property
+    def scale(self) -> int:
+        """Reference size over frame size, in each dimension."""
+        return self.reference.shape[-3] // self.frames.motion.shape[-3]
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Prediction:
+    """What a step returns.
+
+    Attributes:
+      image: ``[..., round(scale * H), round(scale * W), 3]`` linear HDR.
+      aux: named intermediates (flow, masks, features) for losses and pictures.
+      state: new BatchNorm statistics when ``train``, else {}.
+    """
+
+    image: Color
+    aux: dict[str, PyTree] = dataclasses.field(default_factory=dict)
+    state: dict[str, PyTree] = dataclasses.field(default_factory=dict)
+
+
+OPTIONAL_GBUFFERS = ("roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v")
+CHANNELS = {
+    "color": 3, "base_color": 3, "normal": 3, "depth": 1, "roughness": 1, "metallic": 1, "specular": 1,
+    "world_position": 3, "stencil": 1, "n_dot_v": 1, "motion": 2, "reactive": 1,
+}  # fmt: skip
+"""Number of channels of every image a frame may hold."""
+
+
+def frame_images(frame: Frame) -> dict[str, jax.Array | np.ndarray]:
+    """The images that a frame holds, by name; absent ones are left out."""
+    images = {"color": frame.color, "motion": frame.motion, "reactive": frame.reactive}
+    images |= {field.name: getattr(frame.gbuffers, field.name) for field in dataclasses.fields(frame.gbuffers)}
+    return {name: image for name, image in images.items() if image is not None}
+
+
+def require(frame: Frame, names: Iterable[str], method: str) -> None:
+    """Raise a ValueError that names the buffers which ``method`` needs and ``frame`` lacks (``color`` included)."""
+    present = frame_images(frame)
+    missing = [name for name in names if name not in present]
+    if missing:
+        raise ValueError(
+            f"{method} needs the buffers {', '.join(missing)}, which these frames do not have "
+            f"(they have {', '.join(present)}). Render or import them, or choose another method."
+        )
+
+
+def check_shapes(frame: Frame, where: str = "frame") -> None:
+    """Raise a ValueError unless all images of ``frame`` agree in size and have the right number of channels."""
+    height, width = frame.motion.shape[-3:-1]
+    for name, image in frame_images(frame).items():
+        expected = (height, width, CHANNELS[name])
+        if image.shape[-3:] != expected:
+            raise ValueError(
+                f"{where}, channel {name}: expected [..., {height}, {width}, {CHANNELS[name]}] (the size of motion), "
+                f"got {tuple(image.shape)}. Resample it, or pass the matching channels."
+            )
+    if frame.jitter.shape[-1:] != (2,):
+        raise ValueError(f"{where}, jitter: expected [..., 2] (x, y) in pixels, got {tuple(frame.jitter.shape)}.")
+
+
+def _reject(bad: np.ndarray, image: np.ndarray, where: str, name: str, expected: str, fix: str) -> None:
+    if bad.any():
+        at = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{where}, channel {name}: expected {expected}, got {image[at]} at {at} (and {int(bad.sum()) - 1} more of "
+            f"{bad.size} values). {fix}"
+        )
+
+
+def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] = ()) -> None:
+    """Raise a ValueError that names ``where``, the channel, what was expected, what came and what to do.
+
+    Reads the values, so it belongs where data enters, outside jit. Checks presence, sizes, NaN and infinities (depth
+    may be +inf: background), signs and ranges, the jitter and the exposure.
+    """
+    require(frame, requires, where)
+    check_shapes(frame, where)
+    for name, image in frame_images(frame).items():
+        values = np.asarray(image)
+        if name == "depth":
+            bad = np.isnan(values) | (values <= 0)
+            _reject(bad, values, where, name, "positive view-space z, +inf on the background", "Convert it at import.")
+            continue
+        _reject(~np.isfinite(values), values, where, name, "finite values", "Clean or re-render this frame.")
+        if name == "color":
+            _reject(values < 0, values, where, name, "radiance >= 0", "Clamp it at import.")
+        elif name == "stencil":
+            _reject(values < 0, values, where, name, "ids >= 0", "Renumber the objects.")
+        elif name in ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive"):
+            outside = (values < 0) | (values > 1 + 1e-3)
+            _reject(outside, values, where, name, "values in [0, 1]", "Rescale or clamp it at import.")
+    jitter, exposure = np.asarray(frame.jitter), np.asarray(frame.exposure)
+    in_range = np.all((jitter >= -0.5) & (jitter <= 0.5), axis=-1)
+    _reject(~in_range, jitter, where, "jitter", "pixels in [-0.5, 0.5)", "Divide it by the image size or subtract 0.5.")
+    _reject(~((exposure > 0) & np.isfinite(exposure)), exposure, where, "exposure", "a positive number", "Use 1.")
+
+
+def validate_sequence(sequence: Sequence, name: str = "sequence", requires: Iterable[str] = ()) -> None:
+    """``validate_frame`` for each frame, and the sizes of reference, masks and native frames against the frames'."""
+    frames = sequence.frames
+    height, width = frames.motion.shape[-3:-1]
+    length = frames.motion.shape[0]
+    if sequence.reference.shape[0] != length:
+        raise ValueError(f"{name}, reference: expected {length} frames, got {sequence.reference.shape[0]}.")
+    high, wide = sequence.reference.shape[-3:-1]
+    if high % height or wide % width or high // height != wide // width:
+        raise ValueError(
+            f"{name}, reference: expected a whole multiple of {width}x{height}, the same in both dimensions, got "
+            f"{wide}x{high}. Render the reference at twice (or four times) the input size."
+        )
+    for mask_name in ("valid", "steady"):
+        mask = getattr(sequence, mask_name)
+        if mask is not None and mask.shape[-3:] != (height, width, 1):
+            raise ValueError(f"{name}, {mask_name}: expected [..., {height}, {width}, 1], got {tuple(mask.shape)}.")
+    if sequence.native is not None and sequence.native.motion.shape[-3:-1] != (high, wide):
+        size = sequence.native.motion.shape[-3:-1]
+        raise ValueError(f"{name}, native frames: expected {wide}x{high} as the reference, got {size[1]}x{size[0]}.")
+    for index in range(length):
+        frame = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), frames)
+        validate_frame(frame, f"{name}, frame {index}", requires)
+        reference = np.asarray(sequence.reference[index])
+        bad = ~np.isfinite(reference) | (reference < 0)
+        _reject(bad, reference, f"{name}, frame {index}", "reference", "finite radiance >= 0", "Re-render this frame.")
+
+
+def select_time(tree: PyTree, index: int | slice) -> PyTree:
+    """Frame ``index`` (or a range of frames) of a pytree whose leaves are time-major."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def without_color(frame: Frame) -> Frame:
+    """The frame as an extrapolating step sees it: its colour leaf is None."""
+    return dataclasses.replace(frame, color=None)
+
+
+def background(gbuffers: GBuffers) -> jax.Array:
+    """Bool ``[..., H, W, 1]``: true where nothing was hit (depth +inf)."""
+    return ~jnp.isfinite(gbuffers.depth)
+
+
+def depth_scale(gbuffers: GBuffers) -> Scalar:
+    """Median finite depth ``[...]`` of each image (1 if there is none), the unit of ``network_depth``."""
+    flat = gbuffers.depth.reshape(*gbuffers.depth.shape[:-3], -1)
+    median = jnp.nanmedian(jnp.where(jnp.isfinite(flat), flat, jnp.nan), axis=-1)
+    return jnp.where(jnp.isfinite(median), median, 1.0)
+
+
+def network_depth(gbuffers: GBuffers, scale: Scalar) -> Plane:
+    """Depth as networks see it: z / ``scale``, background 0. ``scale`` is ``depth_scale`` of the first frame."""
+    return jnp.where(background(gbuffers), 0.0, gbuffers.depth / scale[..., None, None, None])

@@ -1,0 +1,176 @@
+"""Unroll a method over a sequence: one ``lax.scan``, the same for training, evaluation and benchmarks."""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from essjax.frames import Frame, check_shapes, require, select_time, without_color
+from essjax.interfaces import Method
+from essjax.typing import Array, Callable, PyTree
+
+SS, ESS = "ss", "ess"
+
+
+class Schedule(NamedTuple):
+    """Which frames are rendered. Make one with ``every`` or ``alternate``.
+
+    Attributes:
+      kinds: ``kinds(length)`` is the tuple of "ss" and "ess", one per frame.
+      period: after ``lead`` frames the kinds repeat with this period; that body is scanned.
+      lead: frames stepped before the scan.
+    """
+
+    kinds: Callable[[int], tuple[str, ...]]
+    period: int
+    lead: int
+
+
+def every() -> Schedule:
+    """Every frame is rendered."""
+    return Schedule(lambda length: (SS,) * length, 1, 0)
+
+
+def alternate(parity: int = 0) -> Schedule:
+    """Every other frame is rendered: parity 0 renders 0, 2, 4 ..., parity 1 renders 0 (warm-up), 1, 3, 5 ... (SPEC 0)."""
+    if parity not in (0, 1):
+        raise ValueError(f"parity: expected 0 or 1, got {parity!r}.")
+
+    def kinds(length: int) -> tuple[str, ...]:
+        return tuple(SS if n == 0 or n % 2 == parity else ESS for n in range(length))
+
+    return Schedule(kinds, 2, parity)
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Rollout:
+    """What ``unroll`` returns, time-major.
+
+    Attributes:
+      image: ``[T, ..., h, w, 3]``, frame n's image at index n whatever the method's latency.
+      aux: kind -> pytree of the frames of that kind, in order: what ``keep`` kept.
+      history: the history after the last frame.
+    """
+
+    image: Array
+    aux: dict[str, PyTree]
+    history: PyTree
+
+
+def check_supported(method: Method, frames: Frame, schedule: Schedule) -> None:
+    """Raise a ValueError where a method lacks a buffer or cannot do a kind of frame that the schedule asks for."""
+    check_shapes(frames, "frames")
+    require(frames, ("color", *sorted(method.info.requires)), method.info.name)
+    if method.info.renders_all and ESS in schedule.kinds(frames.motion.shape[0]):
+        raise ValueError(
+            f"{method.info.name} cannot extrapolate: it needs the colour of every frame. Use schedule every()."
+        )
+
+
+def _step(method: Method, variables: PyTree, history: PyTree, frame: Frame, kind: str, train: bool):
+    step = method.render_step if kind == SS else method.extrapolate_step
+    return step(variables, history, frame if kind == SS else without_color(frame), train=train)
+
+
+def unroll(
+    method: Method,
+    variables: PyTree,
+    frames: Frame,
+    schedule: Schedule,
+    *,
+    train: bool = False,
+    keep: Callable[[dict], PyTree] = lambda aux: {},
+    remat: bool = False,
+    scan_unroll: int = 1,
+) -> Rollout:
+    """Run ``method`` over ``frames`` (leaves ``[T, ...]``, colour in every frame).
+
+    Args:
+      method: the two steps.
+      variables: from ``method.init``.
+      frames: the colour of extrapolated frames is removed before the method sees them.
+      schedule: ``every()`` or ``alternate(parity)``.
+      train: passed to the steps.
+      keep: chooses from each prediction's ``aux`` what to stack in time; nothing by default.
+      remat: recompute the steps in the backward pass instead of storing their intermediates.
+      scan_unroll: periods per scan iteration; as many as there are avoids the loop (XLA:CPU differentiates
+        convolutions in a loop 20x slower, docs/adr/0006-unrolled-training-scan.md).
+
+    Raises:
+      ValueError: a buffer is missing, or the schedule extrapolates and the method cannot.
+    """
+    check_supported(method, frames, schedule)
+    length = frames.motion.shape[0]
+    kinds = schedule.kinds(length)
+    pairs = max((length - schedule.lead) // schedule.period, 0)
+    body_end = schedule.lead + pairs * schedule.period
+    history = method.start(select_time(frames, 0))
+
+    def run(history, frame, kind):
+        def step(variables, history, frame):
+            return _step(method, variables, history, frame, kind, train)
+
+        history, prediction = (jax.checkpoint(step) if remat else step)(variables, history, frame)
+        return history, (prediction.image, keep(prediction.aux))
+
+    outputs: list[tuple[int, tuple]] = []  # (frame, output); scanned ones are added below
+    for n in range(min(schedule.lead, length)):
+        history, output = run(history, select_time(frames, n), kinds[n])
+        outputs.append((n, output))
+
+    if pairs:
+        body_kinds = kinds[schedule.lead : schedule.lead + schedule.period]
+        body = jax.tree.map(
+            lambda leaf: leaf[schedule.lead : body_end].reshape(pairs, schedule.period, *leaf.shape[1:]), frames
+        )
+
+        def scan_body(history, chunk):
+            results = []
+            for k, kind in enumerate(body_kinds):
+                history, output = run(history, select_time(chunk, k), kind)
+                results.append(output)
+            return history, tuple(results)
+
+        history, stacked = jax.lax.scan(scan_body, history, body, unroll=min(scan_unroll, pairs))
+        for pair in range(pairs):
+            for k in range(schedule.period):
+                outputs.append((schedule.lead + pair * schedule.period + k, select_time(stacked[k], pair)))
+
+    for n in range(body_end, length):
+        history, output = run(history, select_time(frames, n), kinds[n])
+        outputs.append((n, output))
+
+    return _collect(method, outputs, kinds, history)
+
+
+def _stack(trees: list[PyTree]) -> PyTree:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def _collect(method: Method, outputs: list, kinds: tuple[str, ...], history: PyTree) -> Rollout:
+    images = jnp.stack([image for _, (image, _) in outputs])
+    if method.info.latency:  # step n shows frame n - latency; the last frames repeat the last image
+        shift = method.info.latency
+        images = jnp.concatenate([images[shift:], jnp.repeat(images[-1:], shift, axis=0)])
+    aux = {}
+    for kind in (SS, ESS):
+        chosen = [kept for n, (_, kept) in outputs if kinds[n] == kind]
+        if chosen:
+            aux[kind] = _stack(chosen)
+    return Rollout(image=images, aux=aux, history=history)
+
+
+def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
+    """Indices of the frames of one kind."""
+    return [n for n, k in enumerate(kinds) if k == kind]
+
+
+def stream_step(method: Method, kind: str) -> Callable:
+    """One jitted step, history donated: ``(variables, history, frame) -> (history, image)``. The streaming loop calls it."""
+
+    def step(variables, history, frame):
+        history, prediction = _step(method, variables, history, frame, kind, train=False)
+        return history, prediction.image
+
+    return jax.jit(step, donate_argnums=1)
