@@ -1,0 +1,30 @@
+"""Settings of the whole suite, and the fixtures that every test may use."""
+
+import os
+import tempfile
+
+import hypothesis
+import jax
+import pytest
+
+hypothesis.settings.register_profile("default", deadline=None, max_examples=15, print_blob=True)
+hypothesis.settings.register_profile("ci", parent=hypothesis.settings.get_profile("default"), derandomize=True)
+hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compilation_cache():
+    """Programs compiled twice in one run (new closures, subprocesses) are compiled once; nothing outlives the run."""
+    with tempfile.TemporaryDirectory(prefix="essjax-tests-", ignore_cleanup_errors=True) as folder:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder  # subprocesses
+        jax.config.update("jax_compilation_cache_dir", folder)
+        yield
+        jax.config.update("jax_compilation_cache_dir", None)
+        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+
+
+@pytest.fixture
+def strict_numerics():
+    """No silent dtype or rank promotion; for kernels and losses (optax needs promotion, so never for a train step)."""
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
