@@ -1,0 +1,51 @@
+"""Losses that tie a frame to the one before it, or its two encodings to each other."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+
+from essjax.losses.pixel import check_same_shape, l1
+from essjax.typing import Array, Color, Image, Mask
+
+
+def temporal_l1(image: Color, warped_previous: Color, valid: Mask) -> Color:
+    """``valid * |image - warped_previous|``, ``[..., H, W, 3]``: the first term of ExtraSS eq 13.
+
+    Our reading: masked, because where the warped history shows another surface an unmasked term rewards ghosting.
+    Reduce it with ``masked_mean(..., valid)``.
+
+    Args:
+      image: this frame's output.
+      warped_previous: the previous output at this frame's positions.
+      valid: ``[..., H, W, 1]``, 1 where the warp found the same surface.
+
+    Raises:
+      ValueError: the images' shapes differ.
+    """
+    check_same_shape(image, warped_previous, ("image", "warped_previous"))
+    return jnp.where(valid > 0, valid * jnp.abs(image - warped_previous), 0.0)
+
+
+def feature_l1(features_a: Sequence[Image], features_b: Sequence[Image]) -> list[Image]:
+    """Absolute differences level by level: l_1 of ExtraSS eq 13, between both encoders' features of one frame.
+
+    Args:
+      features_a: one map ``[..., h, w, C]`` per level; sizes may differ between levels.
+      features_b: as many maps of the same shapes.
+
+    Returns:
+      One unreduced map per level; ``sum_of_means`` gives the sum over k.
+
+    Raises:
+      ValueError: another number of levels, or shapes that differ.
+    """
+    if len(features_a) != len(features_b):
+        raise ValueError(
+            f"feature_l1: expected as many levels on both sides, got {len(features_a)} and {len(features_b)}."
+        )
+    return [l1(a, b) for a, b in zip(features_a, features_b, strict=True)]
+
+
+def sum_of_means(levels: Sequence[Image]) -> Array:
+    """Mean of every level, summed: the sum over k in ExtraSS eq 8 and 13. Returns a scalar; 0 without levels."""
+    return sum((jnp.mean(level) for level in levels), start=jnp.zeros(()))
