@@ -1,0 +1,150 @@
+"""OpenEXR files as flat dicts of channels: read everything or raise, write atomically.
+
+The OpenEXR package writes non-contiguous arrays scrambled and drops damaged parts with no more than a printed
+warning; both are caught here. Every failure is a ValueError that begins with the file's name.
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+FULL_PRECISION = frozenset({"depth", "world_position", "motion"})
+"""Layers kept in float32: half resolves 64 px of motion to 1/16 px and 1 km of depth to 0.5 m."""
+HALF_MAX = 65504.0
+_MAGIC = b"\x76\x2f\x31\x01"
+_LFS = b"version https://git-lfs"
+
+
+@contextmanager
+def atomic(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` that replaces it on success and is removed on failure."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def layer(channel: str) -> str:
+    """``"normal"`` of ``"normal.X"``; a channel without a dot is its own layer."""
+    return channel.rpartition(".")[0] or channel
+
+
+def _check_file(path: Path) -> None:
+    if not path.is_file():
+        raise ValueError(f"{path}: expected an EXR file, found {'a folder' if path.is_dir() else 'nothing'}.")
+    with path.open("rb") as file:
+        head = file.read(len(_LFS))
+    if head.startswith(_LFS):
+        raise ValueError(f"{path}: this is a Git LFS pointer, not the image. Fetch the images with: git lfs pull")
+    if not head.startswith(_MAGIC):
+        what = "an empty file" if not head else f"a file that begins with {head[:4]!r}"
+        raise ValueError(f"{path}: expected an EXR file, found {what}. Download or render it again.")
+
+
+def _open(path: Path, header_only: bool) -> OpenEXR.File:
+    try:
+        return OpenEXR.File(str(path), separate_channels=True, header_only=header_only, num_threads=0)
+    except (RuntimeError, ValueError, TypeError) as error:  # UnicodeDecodeError is a ValueError
+        raise ValueError(f"{path}: the EXR header is damaged ({error}). Download or render it again.") from error
+
+
+def _list(names: Iterable[str], limit: int = 12) -> str:
+    names = sorted(names)
+    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+
+
+def read_all(path: str | os.PathLike, expect: Iterable[str] = ()) -> tuple[dict[str, np.ndarray], dict]:
+    """``read``, and the header of the first part."""
+    path = Path(path)
+    _check_file(path)
+    declared = {channel.name for part in _open(path, True).parts for channel in part.header["channels"]}
+    missing = set(expect) - declared
+    if missing:
+        raise ValueError(f"{path}: expected the channels {_list(missing)}; the file has {_list(declared)}.")
+    parts = _open(path, False).parts
+    channels = {name: np.ascontiguousarray(c.pixels) for part in parts for name, c in part.channels.items()}
+    lost = declared - set(channels)
+    if lost:
+        raise ValueError(
+            f"{path}: the file is truncated or damaged: the channels {_list(lost)} cannot be read. "
+            "Download or render it again."
+        )
+    return channels, dict(parts[0].header)
+
+
+def read(path: str | os.PathLike, expect: Iterable[str] = ()) -> dict[str, np.ndarray]:
+    """Read all channels of all parts.
+
+    Args:
+      path: an EXR file.
+      expect: full channel names that must be there, such as ``"ViewLayer.Depth.Z"``.
+
+    Returns:
+      Channel name -> ``[H, W]`` float16, float32 or uint32, contiguous, row 0 on top. Parts may differ in size.
+
+    Raises:
+      ValueError: missing, empty, LFS pointer, not EXR, damaged or truncated, or a channel is missing.
+    """
+    return read_all(path, expect)[0]
+
+
+def _encode(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, int]:
+    """The array as it is stored, and how many values had to be clamped to half's range."""
+    if values.ndim != 2 or not values.size:
+        raise ValueError(f"{path}, channel {name}: expected one [H, W] plane, got shape {values.shape}.")
+    if values.dtype == bool or np.issubdtype(values.dtype, np.integer):
+        if values.dtype != bool and (values.min() < 0 or values.max() > np.iinfo(np.uint32).max):
+            raise ValueError(f"{path}, channel {name}: expected ids in [0, 2^32), got {values.min()}..{values.max()}.")
+        return np.ascontiguousarray(values, np.uint32), 0
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"{path}, channel {name}: expected float or integer values, got {values.dtype}.")
+    allowed = np.isfinite(values) | ((values == np.inf) & (layer(name) == "depth"))
+    if not allowed.all():
+        raise ValueError(
+            f"{path}, channel {name}: expected finite values, got {values[~allowed][0]} in {int((~allowed).sum())} "
+            f"of {values.size} pixels. Clean this frame before writing it (only depth may be +inf: background)."
+        )
+    if layer(name) in FULL_PRECISION:
+        return np.ascontiguousarray(values, np.float32), 0
+    clamped = int((np.abs(values) > HALF_MAX).sum())
+    return np.ascontiguousarray(np.clip(values, -HALF_MAX, HALF_MAX), np.float16), clamped
+
+
+def write(path: str | os.PathLike, channels: Mapping[str, np.ndarray], *, attributes: Mapping | None = None) -> int:
+    """Write planes as one ZIP-compressed part, atomically.
+
+    Floats become half, except the layers of ``FULL_PRECISION`` (float32); integers and bools become uint32. Values
+    beyond half's +-65504 are clamped and counted; NaN and infinities are refused, +inf in ``depth.*`` aside.
+
+    Args:
+      path: the folder must exist.
+      channels: full channel name -> ``[H, W]`` array, all of one size, any memory layout.
+      attributes: more header attributes (str, float, ...).
+
+    Returns:
+      How many values were clamped.
+
+    Raises:
+      ValueError: nothing to write, different sizes, a wrong shape, type or value, or the file cannot be written.
+    """
+    path = Path(path)
+    encoded = {name: _encode(path, name, np.asarray(values)) for name, values in channels.items()}
+    sizes = {name: array.shape for name, (array, _) in encoded.items()}
+    if len(set(sizes.values())) != 1:
+        raise ValueError(f"{path}: expected channels of one size, got {sizes or 'no channels'}.")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
+    with atomic(path) as temporary:
+        try:
+            OpenEXR.File(header, {name: array for name, (array, _) in encoded.items()}, 0).write(str(temporary))
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise ValueError(f"{path}: cannot write the file ({error}). Is the folder there, the disk full?") from error
+        if not temporary.is_file():
+            raise ValueError(f"{path}: cannot write the file. Is the folder there, the disk full?")
+    return sum(clamped for _, clamped in encoded.values())

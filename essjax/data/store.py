@@ -1,0 +1,325 @@
+"""``Sequence``s to and from a dataset folder, frame by frame."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from essjax.cameras import Camera
+from essjax.data import exr
+from essjax.data.layout import (
+    SUFFIXES,
+    Dataset,
+    Segment,
+    SequenceInfo,
+    channel_names,
+    frame_path,
+    read_sequence_info,
+    split_planes,
+    stack_planes,
+    whole,
+    write_sequence_info,
+)
+from essjax.frames import Frame, GBuffers, Sequence, frame_images, select_time, validate_frame
+
+MASKS = ("valid", "steady")
+_GBUFFERS = tuple(field.name for field in dataclasses.fields(GBuffers))
+
+
+def _plain(content: Any) -> Any:
+    """As JSON gives it back: tuples become lists."""
+    return json.loads(json.dumps(content))
+
+
+def _camera_record(camera: Camera | None) -> dict | None:
+    if camera is None:
+        return None
+    return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in dataclasses.fields(camera)}
+
+
+def _frame_record(number: int, frame: Frame, native: Frame | None) -> dict:
+    record = {
+        "number": number,
+        "jitter": np.asarray(frame.jitter).tolist(),
+        "cut": bool(frame.cut),
+        "exposure": float(frame.exposure),
+        "camera": _camera_record(frame.camera),
+    }
+    if native is not None:
+        record |= {
+            "native_jitter": np.asarray(native.jitter).tolist(),
+            "native_camera": _camera_record(native.camera),
+        }
+    return record
+
+
+def _planes(images: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    return {
+        key: plane for name, image in images.items() for key, plane in split_planes(name, np.asarray(image)).items()
+    }
+
+
+class SequenceWriter:
+    """Writes one sequence frame by frame; what is already complete on disk is kept.
+
+    A frame counts as complete once ``sequence.json`` lists it, which happens after its images are in place. Opening
+    an unfinished sequence again resumes it; ``number in writer`` says which frames are there.
+    """
+
+    def __init__(self, root: str | os.PathLike, name: str, *, source: Mapping[str, Any] | None = None):
+        """Open or resume.
+
+        Args:
+          root: the dataset's folder.
+          name: of the sequence, and of its folder.
+          source: what makes these frames (settings, seeds); JSON types.
+
+        Raises:
+          ValueError: the name is not a folder name, or the sequence there was made from another source.
+        """
+        if not name or name != Path(name).name or name.startswith("."):
+            raise ValueError(f"sequence name: expected a plain folder name, got {name!r}.")
+        self.root, self.name, self.source = Path(root), name, _plain(dict(source or {}))
+        self.info: SequenceInfo | None = None
+        if (self.root / name / "sequence.json").is_file():
+            self.info = read_sequence_info(root, name)
+            self._check_source(self.info.source)
+
+    def _check_source(self, found: Mapping[str, Any]) -> None:
+        keys = [key for key in {**self.source, **found} if self.source.get(key) != found.get(key)]
+        if keys:
+            pairs = "; ".join(f"{key}: asked {self.source.get(key)!r}, found {found.get(key)!r}" for key in keys)
+            raise ValueError(
+                f"{self.root / self.name}: holds frames made with other settings ({pairs}). "
+                "Choose another output folder, or delete this one."
+            )
+
+    def __contains__(self, number: int) -> bool:
+        return self.info is not None and number in self.info.numbers
+
+    @property
+    def complete(self) -> bool:
+        """Whether the sequence is finished."""
+        return self.info is not None and self.info.complete
+
+    def _describe(self, frame: Frame, reference: Any, masks: Mapping, native: Frame | None) -> SequenceInfo:
+        height, width = frame.motion.shape[-3:-1]
+        scale = reference.shape[0] // height
+        if reference.shape != (scale * height, scale * width, 3) or scale < 1:
+            raise ValueError(
+                f"sequence {self.name}, reference: expected [s*{height}, s*{width}, 3] with a whole s, "
+                f"got {tuple(reference.shape)}."
+            )
+        if native is not None and native.motion.shape != (*reference.shape[:2], 2):
+            raise ValueError(
+                f"sequence {self.name}, native frames: expected the reference's size {reference.shape[:2]}, "
+                f"got {tuple(native.motion.shape[:2])}."
+            )
+        present = {**frame_images(frame), **masks}
+        channels = tuple(name for name in SUFFIXES if name in present)
+        return SequenceInfo(self.name, width, height, scale, channels, native is not None, self.source)
+
+    def _check_next(self, number: int, described: SequenceInfo, cut: bool) -> SequenceInfo:
+        info = self.info or described
+        for field in ("width", "height", "scale", "channels", "native"):
+            if getattr(info, field) != getattr(described, field):
+                raise ValueError(
+                    f"sequence {self.name}, frame {number}: {field} changes from {getattr(info, field)} to "
+                    f"{getattr(described, field)}; all frames of a sequence must agree."
+                )
+        if info.frames and number != info.numbers[-1] + 1 and not (cut and number > info.numbers[-1]):
+            raise ValueError(
+                f"sequence {self.name}: expected frame {info.numbers[-1] + 1} next, got {number}. Motion links each "
+                "frame to the one before; after a gap the frame must be a cut."
+            )
+        return info
+
+    def write(
+        self,
+        number: int,
+        frame: Frame,
+        reference: Any,
+        *,
+        valid: Any = None,
+        steady: Any = None,
+        native: Frame | None = None,
+    ) -> int:
+        """Write one frame; nothing happens if it is already complete.
+
+        Args:
+          number: original frame number; consecutive, unless the frame is a cut.
+          frame: leaves ``[H, W, C]``, with colour.
+          reference: ``[s*H, s*W, 3]``.
+          valid: ``[H, W, 1]`` or None.
+          steady: ``[H, W, 1]`` or None.
+          native: leaves ``[s*H, s*W, C]`` or None.
+
+        Returns:
+          How many values were beyond half's range and clamped.
+
+        Raises:
+          ValueError: invalid content, or it does not fit to the frames before; names sequence, frame and channel.
+        """
+        if number in self:
+            return 0
+        frame, reference, native = jax.tree.map(np.asarray, (frame, reference, native))
+        where = f"sequence {self.name}, frame {number}"
+        validate_frame(frame, where, ("color",))
+        if native is not None:
+            validate_frame(native, f"{where}, native", ("color",))
+        masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
+        info = self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
+        (self.root / self.name).mkdir(parents=True, exist_ok=True)
+        clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}))
+        hr = {name: reference[..., i] for i, name in enumerate("RGB")}
+        clamped += exr.write(self._path("hr", number), hr)
+        if native is not None:
+            clamped += exr.write(self._path("native", number), _planes(frame_images(native)))
+        record = _plain(_frame_record(number, frame, native))
+        self.info = dataclasses.replace(info, frames=(*info.frames, record))
+        write_sequence_info(self.root, self.info)
+        return clamped
+
+    def _path(self, kind: str, number: int) -> Path:
+        return frame_path(self.root, self.name, kind, number)
+
+    def finish(self) -> SequenceInfo:
+        """Mark the sequence as complete: from now on it can be read."""
+        if self.info is None:
+            raise ValueError(f"{self.root / self.name}: expected at least one frame before finish().")
+        if not self.info.complete:
+            self.info = dataclasses.replace(self.info, complete=True)
+            write_sequence_info(self.root, self.info)
+        return self.info
+
+
+def write_sequence(
+    root: str | os.PathLike, name: str, sequence: Sequence, *, first: int = 0, source: Mapping[str, Any] | None = None
+) -> SequenceInfo:
+    """Write a whole sequence, leaves ``[T, H, W, C]``; ``write_dataset`` then makes a dataset of it.
+
+    Args:
+      root: the dataset's folder.
+      name: of the sequence.
+      sequence: without a batch axis.
+      first: number of its first frame.
+      source: where it comes from.
+    """
+    if sequence.frames.motion.ndim != 4:
+        raise ValueError(
+            f"sequence {name}: expected leaves [T, H, W, C] without a batch axis, got motion "
+            f"{tuple(sequence.frames.motion.shape)}. Write the sequences of a batch one by one."
+        )
+    writer = SequenceWriter(root, name, source=source)
+    sequence = jax.tree.map(np.asarray, sequence)
+    for index in range(sequence.frames.motion.shape[0]):
+        at: Sequence = select_time(sequence, index)
+        writer.write(first + index, at.frames, at.reference, valid=at.valid, steady=at.steady, native=at.native)
+    return writer.finish()
+
+
+def _sized(path: Path, channels: dict[str, np.ndarray], width: int, height: int) -> dict[str, np.ndarray]:
+    for name, plane in channels.items():
+        if plane.shape != (height, width):
+            raise ValueError(
+                f"{path}, channel {name}: expected {width}x{height} as sequence.json says, "
+                f"got {plane.shape[1]}x{plane.shape[0]}."
+            )
+    return channels
+
+
+def _read_images(path: Path, names: Iterable[str], width: int, height: int) -> dict[str, np.ndarray]:
+    names = list(names)
+    expected = [channel for name in names for channel in channel_names(name)]
+    planes = _sized(path, exr.read(path, expected), width, height)
+    return {name: stack_planes(planes, name) for name in names}
+
+
+def _make_camera(record: Mapping | None) -> Camera | None:
+    return None if record is None else Camera(**{key: np.asarray(value, np.float32) for key, value in record.items()})
+
+
+def _make_frame(images: Mapping[str, np.ndarray], record: Mapping, prefix: str = "") -> Frame:
+    return Frame(
+        color=images["color"],
+        gbuffers=GBuffers(**{name: images.get(name) for name in _GBUFFERS}),
+        motion=images["motion"],
+        jitter=np.asarray(record[f"{prefix}jitter"], np.float32),
+        cut=np.asarray(record["cut"], bool),
+        exposure=np.asarray(record["exposure"], np.float32),
+        camera=_make_camera(record[f"{prefix}camera"]),
+        reactive=images.get("reactive"),
+    )
+
+
+def _read_frame(root: Path, info: SequenceInfo, record: Mapping, native: bool) -> Sequence:
+    number, wide, high = record["number"], info.width * info.scale, info.height * info.scale
+    try:
+        images = _read_images(frame_path(root, info.name, "lr", number), info.channels, info.width, info.height)
+        path = frame_path(root, info.name, "hr", number)
+        reference = _sized(path, exr.read(path, "RGB"), wide, high)
+        native_frame = None
+        if native:
+            names = [name for name in info.channels if name not in MASKS]
+            native_images = _read_images(frame_path(root, info.name, "native", number), names, wide, high)
+            native_frame = _make_frame(native_images, record, "native_")
+        return Sequence(
+            frames=_make_frame(images, record),
+            reference=np.stack([reference[name] for name in "RGB"], axis=-1).astype(np.float32),
+            valid=images.get("valid"),
+            steady=images.get("steady"),
+            native=native_frame,
+        )
+    except KeyError as error:
+        raise ValueError(f"{root / info.name / 'sequence.json'}, frame {number}: {error} is missing.") from error
+    except ValueError as error:
+        raise ValueError(f"dataset {root}, sequence {info.name}, frame {number}: {error}") from error
+
+
+def read_sequence(
+    dataset: Dataset,
+    name: str,
+    frames: tuple[int, int] | None = None,
+    *,
+    native: bool = True,
+    threads: int | None = None,
+) -> Sequence:
+    """Read a sequence into memory: NumPy leaves ``[T, H, W, C]``, float32 (``stencil`` int32, ``cut`` bool).
+
+    Args:
+      dataset: from ``read_dataset``.
+      name: of the sequence.
+      frames: numbers of the first and the last frame, both included; None: all. The first frame read is marked as a
+        cut, for what came before it is not there.
+      native: read the native frames too, where there are any.
+      threads: files read at the same time; None: one per core.
+
+    Raises:
+      ValueError: names dataset, sequence, frame, file and channel, what was expected and what came.
+    """
+    if name not in dataset.sequences:
+        raise ValueError(f"{dataset.path}: no sequence {name!r}; there are {', '.join(dataset.sequences)}.")
+    info = dataset.sequences[name]
+    first, last = frames or whole(info)[1:3]
+    records = [record for record in info.frames if first <= record["number"] <= last]
+    if not records or first not in info.numbers or last not in info.numbers:
+        raise ValueError(
+            f"{dataset.path}, sequence {name}: expected a range within the frames {info.numbers[0]}.."
+            f"{info.numbers[-1]}, got {first}..{last}."
+        )
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        parts = list(pool.map(lambda r: _read_frame(dataset.path, info, r, native and info.native), records))
+    sequence: Sequence = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    sequence.frames.cut[0] = True
+    return sequence
+
+
+def read_segment(dataset: Dataset, segment: Segment, *, native: bool = True) -> Sequence:
+    """``read_sequence`` of a segment, warm-up frames included."""
+    return read_sequence(dataset, segment.sequence, (segment.first, segment.last), native=native)
