@@ -59,7 +59,8 @@ class SequenceInfo:
       native: whether there are ``native`` files.
       source: where the frames come from, as the producer describes it.
       frames: one record per complete frame, in order: ``number``, ``jitter``, ``cut``, ``exposure``, ``camera``
-        (``camera_to_world``, ``focal``, ``center``, or None); ``native_jitter`` and ``native_camera`` with native.
+        (``camera_to_world``, ``focal``, ``center``, or None), ``notes`` (counts); ``native_jitter`` and
+        ``native_camera`` with native.
       complete: false while frames are still to be written.
     """
 

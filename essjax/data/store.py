@@ -149,7 +149,8 @@ class SequenceWriter:
         valid: Any = None,
         steady: Any = None,
         native: Frame | None = None,
-    ) -> int:
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
         """Write one frame; nothing happens if it is already complete.
 
         Args:
@@ -159,20 +160,21 @@ class SequenceWriter:
           valid: ``[H, W, 1]`` or None.
           steady: ``[H, W, 1]`` or None.
           native: leaves ``[s*H, s*W, C]`` or None.
-
-        Returns:
-          How many values were beyond half's range and clamped.
+          notes: numbers about this frame to keep in its record; ``clamped``, the count of values beyond half's range
+            that were clamped, is added.
 
         Raises:
           ValueError: invalid content, or it does not fit to the frames before; names sequence, frame and channel.
         """
         if number in self:
-            return 0
+            return
         frame, reference, native = jax.tree.map(np.asarray, (frame, reference, native))
         where = f"sequence {self.name}, frame {number}"
         validate_frame(frame, where, ("color",))
         if native is not None:
             validate_frame(native, f"{where}, native", ("color",))
+        if not (np.isfinite(reference).all() and reference.min() >= 0):
+            raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
         masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
         info = self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
         (self.root / self.name).mkdir(parents=True, exist_ok=True)
@@ -181,10 +183,9 @@ class SequenceWriter:
         clamped += exr.write(self._path("hr", number), hr)
         if native is not None:
             clamped += exr.write(self._path("native", number), _planes(frame_images(native)))
-        record = _plain(_frame_record(number, frame, native))
+        record = _plain({**_frame_record(number, frame, native), "notes": {**(notes or {}), "clamped": clamped}})
         self.info = dataclasses.replace(info, frames=(*info.frames, record))
         write_sequence_info(self.root, self.info)
-        return clamped
 
     def _path(self, kind: str, number: int) -> Path:
         return frame_path(self.root, self.name, kind, number)

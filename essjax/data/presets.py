@@ -1,0 +1,335 @@
+"""Import of renders: one named preset per producer converts its conventions to essjax's, once.
+
+``blender``: a folder with ``meta.json`` and, per frame, ``lr.NNNN.exr`` (jittered colour and passes) and
+``hr.NNNN.exr`` (reference), as Blender writes multi-layer EXR.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from essjax.cameras import Camera, pixel_positions, static_motion, unproject
+from essjax.data import exr
+from essjax.data.layout import Dataset, Segment, SequenceInfo, read_json, write_dataset
+from essjax.data.store import SequenceWriter
+from essjax.frames import Frame, GBuffers
+
+BLENDER_BACKGROUND = 1e9
+"""Blender writes 1e10 as the depth of the background."""
+MIXED_NORMAL = 0.98
+"""A shorter averaged normal is a mixture of surfaces, and so is the motion of that pixel."""
+DYNAMIC_PIXELS = 0.1
+"""An object moves if, in some frame, its motion is more than this off that of a static one (pixels) ..."""
+DYNAMIC_SHARE = 0.1
+"""... in more than this share of its pixels."""
+DYNAMIC_AREA = 16
+"""Frames in which an object has fewer pixels than this do not count."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportReport:
+    """What an import found and did.
+
+    Attributes:
+      dataset: the dataset that was written.
+      sequence: its only sequence.
+      dynamic: object ids that move by themselves; others became stencil 0.
+      totals: counts over all frames: ``pixels`` (LR), ``background`` pixels, ``mixed`` silhouette pixels of static
+        objects whose motion was taken from the cameras, ``negative`` colour values set to 0, ``clamped`` values beyond
+        half's range.
+    """
+
+    dataset: Dataset
+    sequence: SequenceInfo
+    dynamic: tuple[int, ...]
+    totals: Mapping[str, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Dump:
+    """The folder, and ``meta.json`` in essjax's terms."""
+
+    folder: Path
+    width: int
+    height: int
+    scale: int
+    cameras: dict[int, Camera]
+    jitters: dict[int, np.ndarray]
+
+    @property
+    def numbers(self) -> list[int]:
+        return sorted(self.cameras)
+
+
+def _blender_camera(record: Mapping, width: int, height: int) -> Camera:
+    focal = record["lens_mm"] / record["sensor_width_mm"] * width
+    return Camera(
+        camera_to_world=np.asarray(record["camera_to_world"], np.float32).reshape(4, 4),
+        focal=np.asarray([focal, focal], np.float32),
+        center=np.asarray([width / 2, height / 2], np.float32),
+    )
+
+
+def _read_meta(folder: Path) -> _Dump:
+    path = folder / "meta.json"
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: not found. The blender preset expects a folder with meta.json (render_size, display_size and "
+            "per frame jitter, camera_to_world, lens_mm, sensor_width_mm), lr.NNNN.exr and hr.NNNN.exr."
+        )
+    meta = read_json(path)
+    try:
+        (width, height), (wide, high) = meta["render_size"], meta["display_size"]
+        cameras = {int(n): _blender_camera(record, width, height) for n, record in meta["frames"].items()}
+        jitters = {int(n): np.asarray(record["jitter"], np.float32) for n, record in meta["frames"].items()}
+    except KeyError as error:
+        raise ValueError(f"{path}: the field {error} is missing.") from error
+    except (TypeError, ValueError, AttributeError, ZeroDivisionError) as error:
+        raise ValueError(f"{path}: a field has the wrong form ({error}).") from error
+    if not cameras:
+        raise ValueError(f"{path}: expected at least one frame under 'frames', got none.")
+    if (wide, high) != (width * (wide // width), height * (wide // width)):
+        raise ValueError(
+            f"{path}: expected display_size to be a whole multiple of render_size, got {wide}x{high} and "
+            f"{width}x{height}."
+        )
+    return _Dump(folder, width, height, wide // width, cameras, jitters)
+
+
+class _Passes:
+    """Channels of one Blender file, looked up by pass name whatever the view layer is called."""
+
+    def __init__(self, path: Path, width: int, height: int):
+        self.path, self.size, self.channels = path, (height, width), exr.read(path)
+
+    def _plane(self, key: str) -> np.ndarray | None:
+        names = [name for name in self.channels if name == key or name.endswith(f".{key}")]
+        if len(names) > 1:
+            raise ValueError(f"{self.path}: {key} is ambiguous: {', '.join(names)}. Export one view layer only.")
+        if not names:
+            return None
+        plane = self.channels[names[0]]
+        if plane.shape != self.size:
+            raise ValueError(
+                f"{self.path}, channel {names[0]}: expected {self.size[1]}x{self.size[0]} as meta.json says, "
+                f"got {plane.shape[1]}x{plane.shape[0]}."
+            )
+        return plane.astype(np.float32)
+
+    def find(self, name: str, suffixes: str) -> np.ndarray | None:
+        """``[H, W, C]`` float32, or None if the file has no such pass."""
+        planes = [self._plane(f"{name}.{suffix}") for suffix in suffixes]
+        found = [plane for plane in planes if plane is not None]
+        return np.stack(found, axis=-1) if len(found) == len(suffixes) else None
+
+    def get(self, name: str, suffixes: str) -> np.ndarray:
+        """``find``, or a ValueError that says which pass to switch on."""
+        image = self.find(name, suffixes)
+        if image is None:
+            channels = ", ".join(f"{name}.{suffix}" for suffix in suffixes)
+            have = ", ".join(sorted({exr.layer(channel) for channel in self.channels}))
+            raise ValueError(
+                f"{self.path}: expected the channels {channels}; the file has the passes {have}. Switch the pass on in "
+                "Blender (View Layer > Passes; basecolor is a colour AOV) and render again."
+            )
+        return image
+
+
+def _lr(dump: _Dump, number: int) -> _Passes:
+    return _Passes(dump.folder / f"lr.{number:04d}.exr", dump.width, dump.height)
+
+
+def _motions(dump: _Dump, passes: _Passes, number: int, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Motion as rendered, ``previous = current + (X, -Y)``, and that of a static world; both 0 in the first frame."""
+    vector = passes.get("Vector", "XY") * np.array([1.0, -1.0], np.float32)
+    if number - 1 not in dump.cameras:
+        return np.zeros_like(vector), np.zeros_like(vector)
+    camera, previous = dump.cameras[number], dump.cameras[number - 1]
+    positions = pixel_positions(dump.height, dump.width, dump.jitters[number])
+    return vector, np.asarray(static_motion(camera, previous, positions, depth))
+
+
+def _depth(passes: _Passes) -> np.ndarray:
+    depth = passes.get("Depth", "Z")
+    return np.where(depth >= BLENDER_BACKGROUND, np.inf, depth).astype(np.float32)
+
+
+def _object_index(passes: _Passes) -> np.ndarray | None:
+    for name in ("Object Index", "IndexOB"):
+        index = passes.find(name, "X")
+        if index is not None:
+            return np.rint(index).astype(np.int32)
+    return None
+
+
+def _dynamic_ids(dump: _Dump) -> tuple[int, ...]:
+    """Ids of objects whose rendered motion is not that of a static surface under the camera's motion."""
+    dynamic: set[int] = set()
+    for number in dump.numbers:
+        passes = _lr(dump, number)
+        index, depth = _object_index(passes), _depth(passes)
+        if index is None:
+            return ()
+        vector, static = _motions(dump, passes, number, depth)
+        moving = np.linalg.norm(vector - static, axis=-1) > DYNAMIC_PIXELS
+        hit = np.isfinite(depth[..., 0])
+        for identity in np.unique(index[hit]):
+            mine = moving[hit & (index[..., 0] == identity)]
+            if mine.size >= DYNAMIC_AREA and mine.mean() > DYNAMIC_SHARE:
+                dynamic.add(int(identity))
+    return tuple(sorted(dynamic))
+
+
+def _stencil(index: np.ndarray, dynamic: Iterable[int], hit: np.ndarray) -> np.ndarray:
+    """Ids of moving objects, 0 elsewhere. Objects without an index share 0; if those move they get a new id."""
+    dynamic = np.asarray(list(dynamic), np.int32)
+    renamed = np.where(index == 0, dynamic.max(initial=0) + 1, index)
+    return np.where(hit & np.isin(index, dynamic), renamed, 0).astype(np.int32)
+
+
+def _radiance(passes: _Passes) -> tuple[np.ndarray, int]:
+    color = passes.get("Combined", "RGB")
+    return np.maximum(color, 0.0), int((color < 0).sum())
+
+
+def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(length, 1e-6), length
+
+
+def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> tuple[Frame, np.ndarray, dict[str, int]]:
+    """One frame, its reference, and counts of what had to be repaired."""
+    passes = _lr(dump, number)
+    camera, jitter, depth = dump.cameras[number], dump.jitters[number], _depth(passes)
+    hit = np.isfinite(depth)
+    index = _object_index(passes)
+    stencil = None if index is None else _stencil(index, dynamic, hit)
+    normal, length = _unit(passes.get("Normal", "XYZ"))
+    normal = np.where(hit & (length > 1e-3), normal, 0.0).astype(np.float32)
+    position = passes.find("Position", "XYZ")
+    if position is None:
+        position = np.asarray(unproject(camera, pixel_positions(dump.height, dump.width, jitter), depth))
+    position = np.where(hit, position, 0.0).astype(np.float32)
+    to_camera, _ = _unit(np.asarray(camera.camera_to_world)[:3, 3] - position)
+    vector, static = _motions(dump, passes, number, depth)
+    mixed = hit & (length < MIXED_NORMAL) & (True if stencil is None else stencil == 0)
+
+    def scalar(name: str) -> np.ndarray | None:
+        plane = passes.find(name, "X")
+        return None if plane is None else np.where(hit, np.clip(plane, 0.0, 1.0), 0.0).astype(np.float32)
+
+    color, negative = _radiance(passes)
+    reference, negative_reference = _radiance(
+        _Passes(dump.folder / f"hr.{number:04d}.exr", dump.width * dump.scale, dump.height * dump.scale)
+    )
+    gbuffers = GBuffers(
+        base_color=np.where(hit, np.clip(passes.get("basecolor", "RGB"), 0.0, 1.0), 0.0).astype(np.float32),
+        normal=normal,
+        depth=depth,
+        roughness=scalar("roughness"),
+        metallic=scalar("metallic"),
+        world_position=position,
+        stencil=stencil,
+        n_dot_v=np.where(hit, np.clip((normal * to_camera).sum(-1, keepdims=True), 0.0, 1.0), 0.0),
+    )
+    frame = Frame(
+        color=color,
+        gbuffers=gbuffers,
+        motion=np.where(hit & ~mixed, vector, static).astype(np.float32),
+        jitter=jitter,
+        cut=np.asarray(number - 1 not in dump.cameras),
+        exposure=np.float32(1.0),
+        camera=camera,
+    )
+    counts = {
+        "pixels": hit.size,
+        "background": int((~hit).sum()),
+        "mixed": int(mixed.sum()),
+        "negative": negative + negative_reference,
+    }
+    return frame, reference, counts
+
+
+def default_splits(first: int, last: int) -> dict[str, tuple[int, int]]:
+    """First and last frame of 60 % train, 10 % validation, 30 % test, in this order; below 10 frames all is test."""
+    length = last - first + 1
+    if length < 10:
+        return {"test": (first, last)}
+    train, validation = first + int(0.6 * length), max(1, round(0.1 * length))
+    return {
+        "train": (first, train - 1),
+        "validation": (train, train + validation - 1),
+        "test": (train + validation, last),
+    }
+
+
+def clip_segments(name: str, first: int, ranges: Mapping[str, tuple[int, int]]) -> dict[str, list[Segment]]:
+    """Segments of one clip: training clips lie within their range, the others are streamed from the clip's start."""
+    return {
+        split: [Segment(name, start if split == "train" else first, last, start)]
+        for split, (start, last) in ranges.items()
+    }
+
+
+def import_blender(
+    source: str | os.PathLike,
+    out: str | os.PathLike,
+    *,
+    splits: Mapping[str, tuple[int, int]] | None = None,
+    name: str | None = None,
+    on_frame: Callable[[int, int], Any] = lambda done, total: None,
+) -> ImportReport:
+    """Import a clip that Blender rendered; resumes where it was interrupted.
+
+    Background (depth >= 1e9) becomes depth +inf with empty buffers and the sky motion of the cameras; normals get unit
+    length; ``previous = current + (X, -Y)`` of Vector; mixed silhouette pixels of static objects move with the cameras;
+    negative colour becomes 0. Objects that move by themselves keep their index as stencil, all others get 0.
+
+    Args:
+      source: the folder with ``meta.json``.
+      out: the dataset's folder.
+      splits: split -> numbers of the first and last frame, both included; ``default_splits`` if None. Validation and
+        test are streamed from the clip's first frame and scored in their range.
+      name: of the sequence; the folder's name if None.
+      on_frame: called with (frames done, frames in all).
+
+    Raises:
+      ValueError: names the file and what is missing or wrong.
+    """
+    folder = Path(source)
+    dump = _read_meta(folder)
+    name = name or folder.resolve().name
+    numbers = dump.numbers
+    dynamic = _dynamic_ids(dump)
+    writer = SequenceWriter(
+        out, name, source={"preset": "blender", "frames": [numbers[0], numbers[-1]], "dynamic": list(dynamic)}
+    )
+    for done, number in enumerate(numbers):
+        if number not in writer:
+            frame, reference, counts = _convert(dump, number, dynamic)
+            writer.write(number, frame, reference, notes=counts)
+        on_frame(done + 1, len(numbers))
+    info = writer.finish()
+    ranges = dict(splits) if splits else default_splits(numbers[0], numbers[-1])
+    segments = clip_segments(name, numbers[0], ranges)
+    dataset = write_dataset(out, segments, source={"preset": "blender"})
+    totals: dict[str, int] = {}
+    for record in info.frames:
+        for key, count in record["notes"].items():
+            totals[key] = totals.get(key, 0) + count
+    return ImportReport(dataset, info, dynamic, totals)
+
+
+PRESETS: Mapping[str, Callable[..., ImportReport]] = {"blender": import_blender}
+"""Preset name -> function, all with ``import_blender``'s signature."""
+
+
+def import_dataset(source: str | os.PathLike, out: str | os.PathLike, preset: str, **options: Any) -> ImportReport:
+    """Import with a preset by name; an unknown one is a ValueError that lists those there are."""
+    if preset not in PRESETS:
+        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
+    return PRESETS[preset](source, out, **options)
