@@ -1,0 +1,30 @@
+"""Backward warp: what the previous frame showed at this pixel."""
+
+from essjax.cameras import pixel_positions
+from essjax.typing import Image, Motion
+from essjax.warp._batch import check_channels
+from essjax.warp.sampling import sample
+
+
+def backward_warp(image: Image, motion: Motion, *, mode: str = "bilinear", outside: str = "border") -> Image:
+    """Read ``image`` (of the previous frame) at pixel + ``motion``.
+
+    For low-resolution frames that carry jitter, pass ``jittered_motion``; for unjittered history the motion itself.
+    Motion that comes from the renderer needs no gradient; do not ask for one where it is not used, it is slow.
+
+    Args:
+      image: ``[..., H, W, C]``.
+      motion: ``[..., H, W, 2]`` (x right, y down) pixels, current to previous.
+      mode: see ``sample``.
+      outside: see ``sample``.
+
+    Returns:
+      ``[..., H, W, C]``.
+
+    Raises:
+      ValueError: unknown mode or outside, or sizes that differ.
+    """
+    check_channels("image", image, None)
+    check_channels("motion", motion, 2, image.shape[-3:-1])
+    positions = pixel_positions(*motion.shape[-3:-1]) + motion
+    return sample(image, positions, mode=mode, outside=outside)

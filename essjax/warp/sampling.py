@@ -1,0 +1,125 @@
+"""Read an image at fractional positions.
+
+Conventions (those of ``grid_sample`` with ``align_corners=False``, in pixels): the centre of the top left pixel is
+(0.5, 0.5), positions are (x, y). Outside the image either the border pixel repeats (``"border"``) or there is 0
+(``"zeros"``); both hold per tap, so a bilinear read half a pixel outside blends the border pixel with 0.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from essjax.cameras import pixel_positions
+from essjax.typing import Array, Image, Mask, Motion, Positions
+from essjax.warp._batch import check_channels, over_leading_axes
+
+OUTSIDE = ("border", "zeros")
+CUBIC_PARAMETER = {"bicubic": -0.5, "bicubic-0.75": -0.75}
+"""Keys' a: -0.5 keeps quadratics (Catmull-Rom), -0.75 is sharper (what DLCTUS, PyTorch and OpenCV use)."""
+MODES = ("nearest", "bilinear", *CUBIC_PARAMETER)
+
+
+class Tap(NamedTuple):
+    """One tap of a 1-D filter: pixel index (always inside the image) and weight (0 where the read is of nothing)."""
+
+    index: Array
+    weight: Array
+
+
+def check_mode(mode: str, outside: str = "border") -> None:
+    """Raise a ValueError that lists the valid names."""
+    if mode not in MODES:
+        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}.")
+    if outside not in OUTSIDE:
+        raise ValueError(f"outside: expected one of {', '.join(OUTSIDE)}, got {outside!r}.")
+
+
+def _cubic_weights(t: Array, a: float) -> list[Array]:
+    """Weights of the pixels at -1, 0, 1, 2 for fraction ``t`` in [0, 1) (Keys 1981, eq 4)."""
+    inner = lambda d: ((a + 2.0) * d - (a + 3.0)) * d * d + 1.0  # noqa: E731 - d = distance in [0, 1]
+    outer = lambda d: ((a * d - 5.0 * a) * d + 8.0 * a) * d - 4.0 * a  # noqa: E731 - d in [1, 2]
+    return [outer(1.0 + t), inner(t), inner(1.0 - t), outer(2.0 - t)]
+
+
+def axis_taps(positions: Array, size: int, mode: str, outside: str) -> list[Tap]:
+    """The taps that interpolate at ``positions`` (pixels, centres at +0.5) along an axis of ``size`` pixels."""
+    half = {"nearest": 0, "bilinear": 1}.get(mode, 2)
+    # Far outside nothing changes any more; the clamp keeps the integers below from overflowing.
+    positions = jnp.clip(positions.astype(jnp.float32), -3.0, size + 3.0)
+    if mode == "nearest":
+        first, weights = jnp.floor(positions), [jnp.ones_like(positions)]
+    else:
+        x = positions - 0.5
+        t = x - jnp.floor(x)
+        first = jnp.floor(x) - (half - 1)
+        weights = [1.0 - t, t] if mode == "bilinear" else _cubic_weights(t, CUBIC_PARAMETER[mode])
+    first = first.astype(jnp.int32)
+    taps = []
+    for k, weight in enumerate(weights):
+        index = first + k
+        if outside == "zeros":
+            weight = jnp.where((index >= 0) & (index < size), weight, 0.0)
+        taps.append(Tap(jnp.clip(index, 0, size - 1), weight))
+    return taps
+
+
+def gather_pixels(flat: Array, index: Array) -> Array:
+    """Rows ``index`` (any shape, known to be inside) of ``flat`` ``[H * W, C]``: the fast gather."""
+    return flat.at[index].get(mode="promise_in_bounds")
+
+
+def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Array:
+    height, width, channels = image.shape
+    flat = image.reshape(height * width, channels)
+    columns = axis_taps(positions[..., 0], width, mode, outside)
+    rows = axis_taps(positions[..., 1], height, mode, outside)
+    if mode == "nearest":  # no arithmetic: integers stay exact and +inf stays +inf
+        value = gather_pixels(flat, rows[0].index * width + columns[0].index)
+        return jnp.where((rows[0].weight * columns[0].weight)[..., None] > 0, value, jnp.zeros_like(value))
+    total = 0.0
+    for row in rows:
+        for column in columns:
+            value = gather_pixels(flat, row.index * width + column.index).astype(jnp.float32)
+            total = total + value * (row.weight * column.weight)[..., None]
+    return total.astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.floating) else total
+
+
+def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outside: str = "border") -> Image:
+    """Read ``image`` at ``positions``.
+
+    Weights and sums are float32 whatever the image's type. Finite gradients everywhere; bilinear has a kink at pixel
+    centres (its gradient there is that of the right/lower side), nearest has none with respect to positions.
+
+    Args:
+      image: ``[..., H, W, C]``, finite (``mode="nearest"`` also takes infinities and integers unchanged).
+      positions: ``[..., h, w, 2]`` (x, y) in pixels of ``image``, centres at +0.5; another size than the image is fine.
+      mode: "nearest" (the pixel that contains the position), "bilinear", "bicubic" (Keys, a = -0.5) or
+        "bicubic-0.75" (a = -0.75). Bicubic can over- and undershoot.
+      outside: "border" repeats the border pixel, "zeros" reads 0 there.
+
+    Returns:
+      ``[..., h, w, C]``; leading axes broadcast.
+
+    Raises:
+      ValueError: unknown mode or outside, or wrong shapes.
+    """
+    check_mode(mode, outside)
+    check_channels("image", image, None)
+    check_channels("positions", positions, 2)
+    return over_leading_axes(lambda i, p: _sample_one(i, p, mode, outside), (3, 3), image, positions)
+
+
+def inside_mask(motion: Motion) -> Mask:
+    """1 where pixel centre + ``motion`` lies inside the image [0, W] x [0, H], else 0.
+
+    Args:
+      motion: ``[..., H, W, 2]`` in pixels.
+
+    Returns:
+      float32 ``[..., H, W, 1]``.
+    """
+    check_channels("motion", motion, 2)
+    height, width = motion.shape[-3:-1]
+    positions = pixel_positions(height, width) + motion
+    size = jnp.array([width, height], jnp.float32)
+    return jnp.all((positions >= 0) & (positions <= size), axis=-1, keepdims=True).astype(jnp.float32)

@@ -1,0 +1,80 @@
+"""Forward warps: every pixel is written where its motion points."""
+
+import jax.numpy as jnp
+
+from essjax.cameras import pixel_positions
+from essjax.typing import Array, Image, Mask, Motion, Plane
+from essjax.warp._batch import check_channels, over_leading_axes
+from essjax.warp.sampling import axis_taps, gather_pixels
+
+
+def _splat_one(image: Array, motion: Array) -> Array:
+    height, width, channels = image.shape
+    target = pixel_positions(height, width) + motion
+    flat = image.reshape(-1, channels).astype(jnp.float32)
+    total = jnp.zeros((height * width, channels), jnp.float32)
+    for row in axis_taps(target[..., 1], height, "bilinear", "zeros"):
+        for column in axis_taps(target[..., 0], width, "bilinear", "zeros"):
+            weight = (row.weight * column.weight).reshape(-1, 1)
+            index = (row.index * width + column.index).reshape(-1)
+            total = total.at[index].add(weight * flat, mode="promise_in_bounds")
+    return total.reshape(image.shape).astype(image.dtype)
+
+
+def splat(image: Image, motion: Motion) -> Image:
+    """Add every pixel to the four around pixel + ``motion``, with bilinear weights; what falls outside is lost.
+
+    The transpose (adjoint) of ``backward_warp(..., mode="bilinear", outside="zeros")``. Divide by the splat of ones for
+    an average.
+
+    Args:
+      image: ``[..., H, W, C]`` of the current frame.
+      motion: ``[..., H, W, 2]`` pixels, current to previous.
+
+    Returns:
+      ``[..., H, W, C]`` on the previous frame's pixels.
+    """
+    check_channels("image", image, None)
+    check_channels("motion", motion, 2, image.shape[-3:-1])
+    return over_leading_axes(_splat_one, (3, 3), image, motion)
+
+
+def _splat_nearest_one(image: Array, depth: Array, motion: Array) -> tuple[Array, Array]:
+    height, width, channels = image.shape
+    count = height * width
+    target = (pixel_positions(height, width) + motion).reshape(-1, 2)
+    inside = jnp.all((target >= 0) & (target < jnp.array([width, height])), axis=-1)
+    cell = jnp.where(inside[:, None], jnp.floor(target), 0.0).astype(jnp.int32)
+    index = jnp.where(inside, cell[:, 1] * width + cell[:, 0], count)  # outside: past the end, dropped
+    depth = depth.reshape(-1)
+    nearest = jnp.full(count, jnp.inf).at[index].min(depth, mode="drop")
+    wins = inside & (depth == nearest.at[index].get(mode="clip"))
+    # A second minimum, over pixel numbers, makes the winner the same on every backend where depths tie.
+    winner = (
+        jnp.full(count, count, jnp.int32)
+        .at[jnp.where(wins, index, count)]
+        .min(jnp.arange(count, dtype=jnp.int32), mode="drop")
+    )
+    covered = (winner < count)[:, None]
+    value = gather_pixels(image.reshape(-1, channels), jnp.minimum(winner, count - 1))
+    result = jnp.where(covered, value, jnp.zeros_like(value))
+    return result.reshape(image.shape), covered.astype(jnp.float32).reshape(height, width, 1)
+
+
+def splat_nearest(image: Image, depth: Plane, motion: Motion) -> tuple[Image, Mask]:
+    """Write every pixel to the one that contains pixel + ``motion``; where several meet, the nearest depth wins.
+
+    Args:
+      image: ``[..., H, W, C]`` of the current frame; integers and infinities pass unchanged.
+      depth: ``[..., H, W, 1]`` of the current frame, background +inf. Ties: first in rows.
+      motion: ``[..., H, W, 2]`` pixels, current to previous.
+
+    Returns:
+      The image ``[..., H, W, C]`` on the previous frame's pixels, 0 where nothing was written, and the mask
+      ``[..., H, W, 1]`` of where something was.
+    """
+    size = motion.shape[-3:-1]
+    check_channels("image", image, None, size)
+    check_channels("depth", depth, 1, size)
+    check_channels("motion", motion, 2, size)
+    return over_leading_axes(_splat_nearest_one, (3, 3, 3), image, depth, motion)

@@ -1,0 +1,130 @@
+"""From low-resolution, jittered samples to a high-resolution grid, and blocks to channels and back."""
+
+import jax.numpy as jnp
+
+from essjax.cameras import pixel_positions
+from essjax.typing import Array, Image, Jitter, Positions
+from essjax.warp._batch import check_channels, over_leading_axes
+from essjax.warp.sampling import Tap, axis_taps, check_mode
+
+
+def _check_scale(scale: int, name: str = "scale") -> int:
+    if int(scale) != scale or scale < 1:
+        raise ValueError(f"{name}: expected a whole number >= 1, got {scale!r}.")
+    return int(scale)
+
+
+def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Image:
+    """Each LR sample in the HR pixel that it fell into, 0 elsewhere (DLCTUS; SPEC 4).
+
+    The HR pixel is ``scale * p + floor((jitter + 0.5) * scale)``. Upsample an image of ones for the mask.
+
+    Args:
+      image: ``[..., H, W, C]``.
+      scale: whole number.
+      jitter: ``[..., 2]`` (x, y) LR pixels in [-0.5, 0.5).
+
+    Returns:
+      ``[..., scale * H, scale * W, C]``.
+    """
+    scale = _check_scale(scale)
+    check_channels("image", image, None)
+    height, width, channels = image.shape[-3:]
+    offset = jnp.clip(jnp.floor((jitter + 0.5) * scale), 0, scale - 1)  # the clip is for rounding at 0.5
+    here = jnp.arange(scale) == offset[..., None]  # [..., 2, scale]: x, y
+    hit = (here[..., 1, :, None] & here[..., 0, None, :])[..., None, :, None, :, None]
+    blocks = jnp.where(hit, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
+    return blocks.reshape(*blocks.shape[:-5], height * scale, width * scale, channels)
+
+
+def _along(image: Array, taps: list[Tap], axis: int) -> Array:
+    """Interpolate a ``[H, W, C]`` image along axis 0 or 1 at the taps' positions."""
+    shape = (-1, 1, 1) if axis == 0 else (1, -1, 1)
+    return sum(
+        jnp.take(image, tap.index, axis=axis, mode="clip").astype(jnp.float32) * tap.weight.reshape(shape)
+        for tap in taps
+    )  # type: ignore[return-value]
+
+
+def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode: str = "bilinear") -> Image:
+    """JAU: HR pixel P reads the LR image at (P + 0.5) / scale - jitter, where its samples really are (SPEC 4).
+
+    All rows share their vertical position and all columns their horizontal one, so it is two 1-D interpolations.
+
+    Args:
+      image: ``[..., H, W, C]`` sampled at pixel centres + jitter.
+      scale: output size over input size; sizes are rounded.
+      jitter: ``[..., 2]`` (x, y) LR pixels; zeros give ordinary upsampling.
+      mode: see ``sample``; the border repeats.
+
+    Returns:
+      ``[..., round(scale * H), round(scale * W), C]``.
+
+    Raises:
+      ValueError: unknown mode, wrong shapes, or a scale that is not positive.
+    """
+    check_mode(mode)
+    check_channels("image", image, None)
+    if not scale > 0:
+        raise ValueError(f"scale: expected a positive number, got {scale!r}.")
+    height, width = image.shape[-3:-1]
+    rows, columns = ((jnp.arange(round(n * scale), dtype=jnp.float32) + 0.5) / scale for n in (height, width))
+
+    def one(image: Array, jitter: Array) -> Array:
+        wide = _along(image, axis_taps(columns - jitter[0], width, mode, "border"), axis=1)
+        return _along(wide, axis_taps(rows - jitter[1], height, mode, "border"), axis=0).astype(image.dtype)
+
+    return over_leading_axes(one, (3, 1), image, jnp.asarray(jitter))
+
+
+def sample_distance(height: int, width: int, scale: int, jitter: Jitter) -> Positions:
+    """Vector from each HR pixel centre to the LR sample of the LR pixel that contains it.
+
+    Args:
+      height: of the LR image.
+      width: of the LR image.
+      scale: whole number.
+      jitter: ``[..., 2]`` (x, y) LR pixels.
+
+    Returns:
+      ``[..., scale * height, scale * width, 2]`` (x, y) in HR pixels; within +-scale.
+    """
+    scale = _check_scale(scale)
+    centers = pixel_positions(height * scale, width * scale)
+    samples = jnp.floor(centers / scale) + 0.5 + jitter[..., None, None, :]
+    return samples * scale - centers
+
+
+def space_to_depth(x: Image, block: int) -> Image:
+    """Fold blocks of pixels into channels: ``[..., H, W, C]`` to ``[..., H / block, W / block, block^2 C]``.
+
+    Channel order (dy, dx, c): ``out[i, j, (dy * block + dx) * C + c] = x[i * block + dy, j * block + dx, c]``.
+
+    Raises:
+      ValueError: H or W is not a multiple of ``block``.
+    """
+    block = _check_scale(block, "block")
+    height, width, channels = x.shape[-3:]
+    if height % block or width % block:
+        raise ValueError(
+            f"space_to_depth: expected height and width to be multiples of {block}, got {height}x{width}. Pad it first."
+        )
+    x = x.reshape(*x.shape[:-3], height // block, block, width // block, block, channels)
+    x = jnp.swapaxes(x, -4, -3)
+    return x.reshape(*x.shape[:-3], block * block * channels)
+
+
+def depth_to_space(x: Image, block: int) -> Image:
+    """Inverse of ``space_to_depth``: ``[..., h, w, block^2 C]`` to ``[..., h block, w block, C]``.
+
+    Raises:
+      ValueError: the channels are not a multiple of ``block``^2.
+    """
+    block = _check_scale(block, "block")
+    height, width, channels = x.shape[-3:]
+    if channels % block**2:
+        raise ValueError(f"depth_to_space: expected a multiple of {block**2} channels, got {channels}.")
+    channels //= block**2
+    x = x.reshape(*x.shape[:-1], block, block, channels)
+    x = jnp.swapaxes(x, -4, -3)
+    return x.reshape(*x.shape[:-5], height * block, width * block, channels)
