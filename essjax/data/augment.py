@@ -1,0 +1,134 @@
+"""Crops and flips of NumPy sequences that keep every convention: images, motion, jitter, normals, cameras, masks."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from essjax.cameras import Camera
+from essjax.frames import Frame, GBuffers, Sequence, frame_images
+
+_GBUFFERS = tuple(field.name for field in dataclasses.fields(GBuffers))
+_AXES = {"horizontal": 0, "vertical": 1}
+_MIRRORED = {"motion": 2, "normal": 3, "world_position": 3}
+"""Images whose component along the flipped axis changes sign, with their number of components."""
+
+
+def _map_images(frame: Frame, transform: Callable[[str, np.ndarray], np.ndarray]) -> Frame:
+    images = {name: transform(name, np.asarray(image)) for name, image in frame_images(frame).items()}
+    return dataclasses.replace(
+        frame,
+        color=images.get("color"),
+        gbuffers=GBuffers(**{name: images.get(name) for name in _GBUFFERS}),
+        motion=images["motion"],
+        reactive=images.get("reactive"),
+    )
+
+
+def _window(image: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
+    return image[..., top : top + height, left : left + width, :]
+
+
+def _stays_inside(frame: Frame) -> np.ndarray:
+    """1 where the previous position lies within the frame."""
+    height, width = frame.motion.shape[-3:-1]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
+    previous = np.stack([x, y], axis=-1) + np.asarray(frame.jitter)[..., None, None, :] + frame.motion
+    inside = (previous >= 0) & (previous <= np.asarray([width, height]))
+    return inside.all(axis=-1, keepdims=True).astype(np.float32)
+
+
+def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:
+    """Cut a window out of all frames, and the matching one out of the reference; native frames are dropped.
+
+    The principal point moves with the window; pixels whose previous position leaves the window become holes in
+    ``valid``.
+
+    Args:
+      sequence: NumPy leaves ``[T, ..., H, W, C]``.
+      top: first row, LR pixels.
+      left: first column, LR pixels.
+      height: LR pixels.
+      width: LR pixels.
+
+    Raises:
+      ValueError: the window does not fit.
+    """
+    rows, columns = sequence.frames.motion.shape[-3:-1]
+    if not (0 <= top <= rows - height and 0 <= left <= columns - width and height > 0 and width > 0):
+        raise ValueError(f"crop: {width}x{height} at ({left}, {top}) does not fit into frames of {columns}x{rows}.")
+    scale, frames = sequence.scale, sequence.frames
+    cropped = _map_images(frames, lambda _, image: _window(image, top, left, height, width))
+    camera = frames.camera
+    if camera is not None:
+        camera = dataclasses.replace(camera, center=camera.center - np.asarray([left, top], np.float32))
+    cropped = dataclasses.replace(cropped, camera=camera)
+    valid, steady = (
+        None if mask is None else _window(mask, top, left, height, width) for mask in (sequence.valid, sequence.steady)
+    )
+    return Sequence(
+        frames=cropped,
+        reference=_window(sequence.reference, scale * top, scale * left, scale * height, scale * width),
+        valid=None if valid is None else valid * _stays_inside(cropped),
+        steady=steady,
+    )
+
+
+def _flip_camera(camera: Camera, component: int, size: int) -> Camera:
+    mirror = np.ones(4, np.float32)
+    mirror[component] = -1.0
+    center = np.array(camera.center, np.float32)
+    center[..., component] = size - center[..., component]
+    return Camera(
+        camera_to_world=mirror[:, None] * np.asarray(camera.camera_to_world) * mirror,
+        focal=camera.focal,
+        center=center,
+    )
+
+
+def _flip_frame(frame: Frame, component: int) -> Frame:
+    axis = -2 if component == 0 else -3
+
+    def transform(name: str, image: np.ndarray) -> np.ndarray:
+        flipped = np.flip(image, axis)
+        if name in _MIRRORED:
+            sign = np.ones(_MIRRORED[name], image.dtype)
+            sign[component] = -1
+            flipped = flipped * sign
+        return flipped
+
+    sign = np.ones(2, np.float32)
+    sign[component] = -1
+    size = frame.motion.shape[axis]
+    return dataclasses.replace(
+        _map_images(frame, transform),
+        jitter=frame.jitter * sign,
+        camera=None if frame.camera is None else _flip_camera(frame.camera, component, size),
+    )
+
+
+def flip(sequence: Sequence, direction: str) -> Sequence:
+    """Mirror the images left to right ("horizontal") or top to bottom ("vertical"), and the world with them.
+
+    The world is mirrored in x (or y) and so is camera space: ``camera_to_world' = M C M``, a proper rotation again,
+    so positions still project to their pixels. Motion, jitter, normals and positions change sign along that axis. A jitter
+    of -0.5 becomes +0.5.
+
+    Args:
+      sequence: NumPy leaves ``[T, ..., H, W, C]``.
+      direction: "horizontal" or "vertical".
+
+    Raises:
+      ValueError: another direction.
+    """
+    if direction not in _AXES:
+        raise ValueError(f"direction: expected horizontal or vertical, got {direction!r}.")
+    component = _AXES[direction]
+    axis = -2 if component == 0 else -3
+    masks = {name: getattr(sequence, name) for name in ("valid", "steady")}
+    return Sequence(
+        frames=_flip_frame(sequence.frames, component),
+        reference=np.flip(sequence.reference, axis),
+        native=None if sequence.native is None else _flip_frame(sequence.native, component),
+        **{name: None if mask is None else np.flip(mask, axis) for name, mask in masks.items()},
+    )
