@@ -29,7 +29,7 @@ def _neighbour_signs(image: Image, window: int) -> Array:
 
 
 def _census_distance(first: Image, second: Image, window: int) -> Plane:
-    """Mean soft census cost over the window and the channels, ``[..., H, W, 1]``; 0 where the window leaves the image."""
+    """Mean soft census cost over window and channels, ``[..., H, W, 1]``; 0 where the window leaves the image."""
     height, width = first.shape[-3:-1]
     if window < 3 or window % 2 == 0:
         raise ValueError(f"window: expected an odd size >= 3, got {window}.")

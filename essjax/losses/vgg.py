@@ -122,17 +122,17 @@ def _convolution(
 
 def _activations(parameters: dict, image: Color, layers: tuple[str, ...]) -> list[Image]:
     shown = jnp.clip(display(image), 0.0, 1.0)
-    value = (shown - jnp.array(IMAGENET_MEAN, shown.dtype)) / jnp.array(IMAGENET_STD, shown.dtype)
-    leading = value.shape[:-3]
-    value = value.reshape(-1, *value.shape[-3:])
+    leading = shown.shape[:-3]
+    mean, deviation = (jnp.array(values, shown.dtype).reshape(1, 1, 1, 3) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    value = (shown.reshape(-1, *shown.shape[-3:]) - mean) / deviation
     found, block = {}, "1"
-    for name, convolution in parameters.items():  # in the order of LAYERS: jax keeps it, and so must we
+    for name, convolution in parameters.items():  # sorted names are the order of LAYERS, and jax sorts a dict's keys
         if name[4] != block:
             block = name[4]
             value = jax.lax.reduce_window(value, -jnp.inf, jax.lax.max, (1, 2, 2, 1), (1, 2, 2, 1), "VALID")
         value = jax.lax.conv_general_dilated(
             value, convolution["weight"], (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
-        value = jax.nn.relu(value + convolution["bias"])
+        value = jax.nn.relu(value + convolution["bias"].reshape(1, 1, 1, -1))
         found[name] = value.reshape(*leading, *value.shape[1:])
     return [found[name] for name in layers]

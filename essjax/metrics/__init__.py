@@ -1,0 +1,15 @@
+"""Metrics on display-referred images in [0, 1]: one value per image, data range 1.
+
+``score_rollout`` and everything printed take linear HDR and apply ``essjax.color.display`` (x / (1 + x), then sRGB);
+the single metrics take images that already are display-referred, with any leading axes.
+"""
+
+from essjax.metrics.psnr import MAX_PSNR, psnr
+from essjax.metrics.score import METRICS, MIN_HOLE_PIXELS, aggregate, score_rollout
+from essjax.metrics.ssim import ssim, ssim_map
+from essjax.metrics.temporal import flicker, tpsnr, warped_error
+
+__all__ = [
+    "MAX_PSNR", "METRICS", "MIN_HOLE_PIXELS", "aggregate", "flicker", "psnr", "score_rollout", "ssim", "ssim_map",
+    "tpsnr", "warped_error",
+]  # fmt: skip

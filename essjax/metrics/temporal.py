@@ -1,0 +1,58 @@
+"""Temporal stability: what flickers between two frames although it should not."""
+
+import jax.numpy as jnp
+
+from essjax.losses import masked_mean
+from essjax.losses.pixel import check_same_shape
+from essjax.metrics.psnr import PIXEL_AXES, psnr
+from essjax.typing import Image, Mask, Motion, Scalar
+from essjax.warp import backward_warp
+
+
+def flicker(prediction: Image, prediction_previous: Image, target: Image, target_previous: Image) -> Image:
+    """Signed change over time that the target lacks: ``(P_t - P_{t-1}) - (T_t - T_{t-1})``, ``[..., H, W, C]``
+
+    Raises:
+      ValueError: the shapes of the frames differ.
+    """
+    check_same_shape(prediction, prediction_previous, ("prediction", "prediction_previous"))
+    check_same_shape(target, target_previous, ("target", "target_previous"))
+    check_same_shape(prediction, target)
+    return (prediction - prediction_previous) - (target - target_previous)
+
+
+def tpsnr(prediction: Image, prediction_previous: Image, target: Image, target_previous: Image) -> Scalar:
+    """PSNR of frame differences in dB ``[...]``, data range 1: how small the ``flicker`` is.
+
+    Args:
+      prediction: ``[..., H, W, C]`` display-referred, frame t.
+      prediction_previous: the same method's frame t-1.
+      target: the reference of frame t.
+      target_previous: the reference of frame t-1.
+
+    Raises:
+      ValueError: the shapes differ.
+    """
+    difference = flicker(prediction, prediction_previous, target, target_previous)
+    return psnr(difference, jnp.zeros_like(difference))
+
+
+def warped_error(image: Image, image_previous: Image, motion: Motion, *, valid: Mask | None = None) -> Scalar:
+    """Mean ``|I_t - warp(I_{t-1})|`` of each image, ``[...]``: what changes although the surface is the same.
+
+    Moving shadows and mirror images change in the reference as well: compare a method's value with the reference's.
+
+    Args:
+      image: ``[..., H, W, C]`` display-referred, frame t.
+      image_previous: frame t-1.
+      motion: ``[..., H, W, 2]`` pixels of this resolution; with the jitter difference where both frames are jittered.
+      valid: ``[..., H, W, 1]``, 1 where the previous frame shows the same surface; all pixels if None. NaN where empty.
+
+    Raises:
+      ValueError: the shapes differ.
+    """
+    check_same_shape(image, image_previous, ("image", "image_previous"))
+    error = jnp.abs(image - backward_warp(image_previous, motion))
+    if valid is None:
+        return jnp.mean(error, axis=PIXEL_AXES)
+    return jnp.where(jnp.sum(valid, axis=PIXEL_AXES) > 0, masked_mean(error, valid, axis=PIXEL_AXES), jnp.nan)

@@ -1,0 +1,101 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from essjax.metrics import METRICS, aggregate, flicker, score_rollout, tpsnr, warped_error
+from tests.helpers import random_image
+
+T, H, W = 5, 13, 18
+
+
+def shown(linear):
+    """Display transform, written again in NumPy."""
+    linear = np.asarray(linear, np.float64)
+    linear = linear / (1 + linear)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_tpsnr_by_hand():
+    frames = [random_image(k, 6, 7, 3, high=0.4) for k in range(2)]
+    # A constant error does not flicker; one that grows by 0.1 scores 20 dB.
+    assert float(tpsnr(frames[1] + 0.3, frames[0] + 0.3, frames[1], frames[0])) > 90
+    assert float(tpsnr(frames[1] + 0.3, frames[0] + 0.2, frames[1], frames[0])) == pytest.approx(20, abs=1e-3)
+    np.testing.assert_allclose(flicker(frames[1] + 0.3, frames[0] + 0.2, frames[1], frames[0]), 0.1, atol=1e-6)
+
+
+def test_warped_error_follows_the_motion():
+    previous = random_image(1, 2, H, W, 3, high=1.0)
+    image = jnp.roll(previous, 2, axis=-2)  # moved right by 2: previous = current + (-2, 0)
+    motion = jnp.broadcast_to(jnp.array([-2.0, 0.0]), (2, H, W, 2))
+    valid = jnp.ones((2, H, W, 1)).at[:, :, :2].set(0.0)
+    np.testing.assert_allclose(jax.jit(warped_error)(image, previous, motion, valid=valid), 0.0, atol=1e-6)
+    assert (np.asarray(warped_error(image, previous, -motion, valid=valid)) > 0.1).all()
+    still = jnp.zeros_like(motion)
+    expected = np.abs(np.asarray(image) - np.asarray(previous)).mean((1, 2, 3))
+    np.testing.assert_allclose(warped_error(image, previous, still), expected, rtol=1e-5)
+    assert np.isnan(warped_error(image, previous, motion, valid=0.0 * valid)).all()
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    targets = random_image(0, T, H, W, 3, high=4.0)
+    images = jnp.maximum(targets + random_image(1, T, H, W, 3, low=-0.3, high=0.3), 0.0)
+    holes = jnp.zeros((T, H, W, 1)).at[:, 2:8, 3:7].set(1.0).at[4].set(0.0).at[4, 0, :15].set(1.0)
+    return {"images": images, "targets": targets, "holes": holes, "motion": jnp.zeros((T, H, W, 2))}
+
+
+KINDS = ("ss", "ess", "ss", "ess", "ss")
+
+
+def test_score_rollout_matches_numpy(rollout):
+    rows = score_rollout(**rollout, scored=[2, 3, 4], kinds=KINDS)
+    assert list(rows) == [2, 3, 4]
+    assert [row["kind"] for row in rows.values()] == ["ss", "ess", "ss"]
+    images, targets = shown(rollout["images"]), shown(rollout["targets"])
+    for n, row in rows.items():
+        assert row["psnr"] == pytest.approx(peak_signal_noise_ratio(targets[n], images[n], data_range=1), rel=1e-4)
+        expected = structural_similarity(
+            images[n], targets[n], channel_axis=-1, data_range=1,
+            gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        )  # fmt: skip
+        assert row["ssim"] == pytest.approx(expected, abs=1e-4)
+        change = (images[n] - images[n - 1]) - (targets[n] - targets[n - 1])
+        assert row["tpsnr"] == pytest.approx(-10 * np.log10((change**2).mean()), rel=1e-4)
+        valid = np.asarray(rollout["holes"][n, ..., 0]) == 0
+        assert row["warped_error"] == pytest.approx(np.abs(images[n] - images[n - 1])[valid].mean(), rel=1e-4)
+        expected = np.abs(targets[n] - targets[n - 1])[valid].mean()
+        assert row["warped_error_reference"] == pytest.approx(expected, rel=1e-4)
+        assert row["hole_share"] == pytest.approx(1 - valid.mean(), rel=1e-5)
+    error = (images[3] - targets[3])[2:8, 3:7] ** 2
+    assert rows[3]["psnr_holes"] == pytest.approx(-10 * np.log10(error.mean()), rel=1e-4)
+    assert rows[4]["psnr_holes"] is None  # 15 pixels are too few
+
+
+def test_first_frame_and_missing_masks(rollout):
+    first = score_rollout(**rollout, scored=[0], kinds=KINDS)[0]
+    assert first["tpsnr"] is None and first["warped_error"] is None and first["psnr"] > 0
+    bare = score_rollout(rollout["images"], rollout["targets"], scored=[1], kinds=KINDS)[1]
+    assert set(bare) == {"kind", *METRICS}
+    assert bare["tpsnr"] > 0
+    assert all(bare[name] is None for name in ("psnr_holes", "hole_share", "warped_error", "warped_error_reference"))
+    assert score_rollout(**rollout, scored=[], kinds=KINDS) == {}
+
+
+def test_aggregate_is_the_mean_of_what_is_there():
+    mean = aggregate([{"psnr": 20.0, "psnr_holes": None}, {"psnr": 30.0, "psnr_holes": 12.0, "kind": "ss"}])
+    assert mean["psnr"] == 25.0 and mean["psnr_holes"] == 12.0 and mean["ssim"] is None and mean["frame_count"] == 2
+    assert set(mean) == {*METRICS, "frame_count"}
+    assert aggregate([])["psnr"] is None
+
+
+def test_messages(rollout):
+    with pytest.raises(ValueError, match="kinds: expected one per frame, 5, got 2"):
+        score_rollout(**rollout, scored=[1], kinds=("ss", "ess"))
+    with pytest.raises(ValueError, match=r"scored: expected frames from 0 to 4, got \[5\]"):
+        score_rollout(**rollout, scored=[2, 5], kinds=KINDS)
+    with pytest.raises(ValueError, match=r"holes: expected \(5, 13, 18\) as the images, got \(5, 6, 9\)"):
+        score_rollout(**{**rollout, "holes": jnp.zeros((5, 6, 9, 1))}, scored=[2], kinds=KINDS)
+    with pytest.raises(ValueError, match="images and targets: expected the same shape"):
+        score_rollout(rollout["images"][:3], rollout["targets"], scored=[2], kinds=KINDS)
