@@ -111,8 +111,8 @@ def flip(sequence: Sequence, direction: str) -> Sequence:
     """Mirror the images left to right ("horizontal") or top to bottom ("vertical"), and the world with them.
 
     The world is mirrored in x (or y) and so is camera space: ``camera_to_world' = M C M``, a proper rotation again,
-    so positions still project to their pixels. Motion, jitter, normals and positions change sign along that axis. A jitter
-    of -0.5 becomes +0.5.
+    so positions still project to their pixels. Motion, jitter, normals and positions change sign along that axis.
+    A jitter of -0.5 becomes +0.5.
 
     Args:
       sequence: NumPy leaves ``[T, ..., H, W, C]``.

@@ -80,11 +80,10 @@ def _check_alike(source: Source, crop: tuple[int, int] | None) -> None:
     """All sequences must hold the same buffers at the same scale, and be of one size or fit the crop."""
     bare = [dataclasses.replace(source[index], native=None) for index in range(len(source))]
     for index, sequence in enumerate(bare):
-        height, width = sequence.frames.motion.shape[1:3]
-        if sequence.frames.motion.ndim != 4:
-            raise ValueError(
-                f"clips: expected sequences [T, H, W, C], got motion {sequence.frames.motion.shape} in sequence {index}."
-            )
+        shape = sequence.frames.motion.shape
+        if len(shape) != 4:
+            raise ValueError(f"clips: expected sequences [T, H, W, C], got motion {shape} in sequence {index}.")
+        height, width = shape[1:3]
         if crop is not None and (crop[0] > height or crop[1] > width or min(crop) < 1):
             raise ValueError(
                 f"clips: a crop of {crop[1]}x{crop[0]} does not fit into sequence {index} of {width}x{height}."
