@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def _map_images(frame: Frame, transform: Callable[[str, np.ndarray], np.ndarray]
     )
 
 
-def _window(image: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
+def _window(image: Any, top: int, left: int, height: int, width: int) -> Any:
     return image[..., top : top + height, left : left + width, :]
 
 
@@ -35,7 +36,7 @@ def _stays_inside(frame: Frame) -> np.ndarray:
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
     previous = np.stack([x, y], axis=-1) + np.asarray(frame.jitter)[..., None, None, :] + frame.motion
     inside = (previous >= 0) & (previous <= np.asarray([width, height]))
-    return inside.all(axis=-1, keepdims=True).astype(np.float32)
+    return np.asarray(inside.all(axis=-1, keepdims=True), np.float32)
 
 
 def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:

@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import Any, Protocol
 
 import grain
 import jax
@@ -117,7 +117,7 @@ def make_clip(
     return dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, cut=cut))
 
 
-def _stack(batch: list[Sequence]) -> Sequence:
+def _stack(batch: Any) -> Sequence:
     return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *batch)
 
 

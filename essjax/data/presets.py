@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from essjax.cameras import Camera, pixel_positions, static_motion, unproject
@@ -149,8 +150,8 @@ def _motions(dump: _Dump, passes: _Passes, number: int, depth: np.ndarray) -> tu
     if number - 1 not in dump.cameras:
         return np.zeros_like(vector), np.zeros_like(vector)
     camera, previous = dump.cameras[number], dump.cameras[number - 1]
-    positions = pixel_positions(dump.height, dump.width, dump.jitters[number])
-    return vector, np.asarray(static_motion(camera, previous, positions, depth))
+    positions = pixel_positions(dump.height, dump.width, jnp.asarray(dump.jitters[number]))
+    return vector, np.asarray(static_motion(camera, previous, positions, jnp.asarray(depth)))
 
 
 def _depth(passes: _Passes) -> np.ndarray:
@@ -212,7 +213,8 @@ def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> tuple[Frame,
     normal = np.where(hit & (length > 1e-3), normal, 0.0).astype(np.float32)
     position = passes.find("Position", "XYZ")
     if position is None:
-        position = np.asarray(unproject(camera, pixel_positions(dump.height, dump.width, jitter), depth))
+        positions = pixel_positions(dump.height, dump.width, jnp.asarray(jitter))
+        position = np.asarray(unproject(camera, positions, jnp.asarray(depth)))
     position = np.where(hit, position, 0.0).astype(np.float32)
     to_camera, _ = _unit(np.asarray(camera.camera_to_world)[:3, 3] - position)
     vector, static = _motions(dump, passes, number, depth)
