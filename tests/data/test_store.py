@@ -1,0 +1,245 @@
+"""The dataset folder: round trips, resuming, and errors that say which frame of which sequence is wrong."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from essjax.data import (
+    Segment,
+    SequenceWriter,
+    exr,
+    read_dataset,
+    read_segment,
+    read_sequence,
+    write_dataset,
+    write_sequence,
+)
+from essjax.frames import select_time, validate_sequence
+from tests.helpers import make_sequence
+
+
+def sequence(seed=0, T=5, H=6, W=9, **options):
+    """One sequence without a batch axis, NumPy leaves."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), make_sequence(seed, T, 1, H, W, **options))
+
+
+def assert_close(actual, expected):
+    """Equal up to half precision; infinities, ids and flags exactly."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2**-11, atol=1e-6), actual, expected)
+    for name in ("depth", "world_position", "stencil"):
+        np.testing.assert_array_equal(getattr(actual.frames.gbuffers, name), getattr(expected.frames.gbuffers, name))
+    np.testing.assert_array_equal(actual.frames.motion, expected.frames.motion)
+
+
+def write_frames(writer, source, numbers, first):
+    for number in numbers:
+        at = select_time(source, number - first)
+        writer.write(number, at.frames, at.reference, valid=at.valid, steady=at.steady, native=at.native)
+
+
+@pytest.mark.parametrize("native", [False, True])
+@pytest.mark.parametrize("scale", [2, 3])
+def test_round_trip(tmp_path, native, scale):
+    written = sequence(scale=scale, native=native)
+    write_sequence(tmp_path, "a", written, first=8, source={"seed": 1})
+    dataset = write_dataset(tmp_path, {"train": ["a"]}, source={"made": "by hand"})
+    assert read_dataset(tmp_path) == dataset
+    assert dataset.info.scale == scale and dataset.info.source == {"seed": 1} and dataset.info.native == native
+    back = read_sequence(dataset, "a")
+    assert_close(back, written)
+    validate_sequence(back, "a")
+    assert {leaf.dtype for leaf in jax.tree.leaves(back)} == {np.dtype(t) for t in (np.float32, np.int32, bool)}
+    assert read_sequence(dataset, "a", native=False).native is None
+
+
+def test_absent_buffers_stay_absent(tmp_path):
+    full = sequence()
+    gbuffers = dataclasses.replace(full.frames.gbuffers, specular=None, n_dot_v=None)
+    reactive = np.full_like(full.frames.gbuffers.roughness, 0.25)
+    frames = dataclasses.replace(full.frames, gbuffers=gbuffers, camera=None, reactive=reactive)
+    bare = dataclasses.replace(full, frames=frames, valid=None, steady=full.valid)
+    write_sequence(tmp_path, "a", bare)
+    assert_close(read_sequence(write_dataset(tmp_path, {"train": ["a"]}), "a"), bare)
+
+
+def test_a_range_of_frames_keeps_original_numbers_and_starts_with_a_cut(tmp_path):
+    written = sequence(T=6)
+    write_sequence(tmp_path, "a", written, first=8)
+    dataset = write_dataset(tmp_path, {"test": [Segment("a", 9, 12, 11)]})
+    segment = dataset.segments("test")[0]
+    back = read_segment(dataset, segment)
+    np.testing.assert_array_equal(back.frames.motion, written.frames.motion[1:5])
+    np.testing.assert_array_equal(back.frames.cut, [True, False, False, False])
+    assert segment.score_from == 11
+    with pytest.raises(ValueError, match=r"sequence a: expected a range within the frames 8\.\.13, got 7\.\.9"):
+        read_sequence(dataset, "a", (7, 9))
+    with pytest.raises(ValueError, match="no sequence 'b'; there are a"):
+        read_sequence(dataset, "b")
+    with pytest.raises(ValueError, match="no split 'train'; this dataset has test"):
+        dataset.segments("train")
+
+
+def test_an_interrupted_sequence_resumes_and_keeps_complete_frames(tmp_path):
+    """The second writer is given different pixels: frames 3 and 4 must be the first writer's, 5 and 6 the second's."""
+    first, second = sequence(0, T=4), sequence(1, T=4)
+    source = {"seed": 1, "size": (9, 6)}
+    write_frames(SequenceWriter(tmp_path, "a", source=source), first, [3, 4], 3)
+    with pytest.raises(ValueError, match="sequence a is unfinished .2 frames so far.*it resumes"):
+        write_dataset(tmp_path, {"train": ["a"]})
+    writer = SequenceWriter(tmp_path, "a", source=source)
+    assert [n in writer for n in (3, 4, 5)] == [True, True, False] and not writer.complete
+    write_frames(writer, second, [3, 4, 5, 6], 3)
+    writer.finish()
+    assert SequenceWriter(tmp_path, "a", source=source).complete
+    back = read_sequence(write_dataset(tmp_path, {"train": ["a"]}), "a")
+    np.testing.assert_array_equal(back.frames.motion[:2], first.frames.motion[:2])
+    np.testing.assert_array_equal(back.frames.motion[2:], second.frames.motion[2:])
+
+
+def test_a_write_that_dies_between_two_images_leaves_the_frame_incomplete(tmp_path, monkeypatch):
+    source = sequence(T=2)
+    writer = SequenceWriter(tmp_path, "a")
+    write_frames(writer, source, [0], 0)
+    real = exr.write
+
+    def dies_at_reference(path, channels):
+        if path.name == "hr.0001.exr":
+            raise KeyboardInterrupt
+        return real(path, channels)
+
+    monkeypatch.setattr(exr, "write", dies_at_reference)
+    with pytest.raises(KeyboardInterrupt):
+        write_frames(writer, source, [1], 0)
+    monkeypatch.undo()
+    resumed = SequenceWriter(tmp_path, "a")
+    assert 0 in resumed and 1 not in resumed
+    write_frames(resumed, source, [0, 1], 0)
+    resumed.finish()
+    assert_close(read_sequence(write_dataset(tmp_path, {"train": ["a"]}), "a"), source)
+    assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".tmp")]
+
+
+def test_other_settings_do_not_resume(tmp_path):
+    write_sequence(tmp_path, "a", sequence(), source={"seed": 1, "spp": 16})
+    with pytest.raises(
+        ValueError, match=r"made with other settings \(spp: asked 64, found 16\).*another output folder"
+    ):
+        SequenceWriter(tmp_path, "a", source={"seed": 1, "spp": 64})
+
+
+def test_frames_must_follow_each_other(tmp_path):
+    source = sequence(T=3)
+    writer = SequenceWriter(tmp_path, "a")
+    write_frames(writer, source, [0], 0)
+    at = select_time(source, 2)
+    with pytest.raises(ValueError, match="sequence a: expected frame 1 next, got 2"):
+        writer.write(2, at.frames, at.reference, valid=at.valid)
+    cut = dataclasses.replace(at.frames, cut=np.asarray(True))
+    with pytest.raises(ValueError, match="frame 2: channels changes from"):
+        writer.write(2, cut, at.reference)
+    writer.write(2, cut, at.reference, valid=at.valid)
+    assert writer.finish().numbers == (0, 2)
+
+
+def test_invalid_content_is_refused_with_names(tmp_path):
+    at = select_time(sequence(), 0)
+    writer = SequenceWriter(tmp_path, "a")
+    motion = at.frames.motion.copy()
+    motion[2, 3, 0] = np.nan
+    with pytest.raises(ValueError, match=r"sequence a, frame 7, channel motion: expected finite values, got nan"):
+        writer.write(7, dataclasses.replace(at.frames, motion=motion), at.reference)
+    with pytest.raises(ValueError, match=r"sequence a, reference: expected \[s\*6, s\*9, 3\] with a whole s"):
+        writer.write(7, at.frames, at.reference[:, :-1])
+    with pytest.raises(ValueError, match=r"sequence a, frame 7, reference: expected finite radiance >= 0, got -1\."):
+        writer.write(7, at.frames, at.reference - 1.0 - at.reference)
+    with pytest.raises(ValueError, match="frame 7 needs the buffers color"):
+        writer.write(7, dataclasses.replace(at.frames, color=None), at.reference)
+    with pytest.raises(ValueError, match="expected at least one frame before finish"):
+        writer.finish()
+    with pytest.raises(ValueError, match="expected a plain folder name, got 'a/b'"):
+        SequenceWriter(tmp_path, "a/b")
+    with pytest.raises(ValueError, match=r"sequence a: expected leaves \[T, H, W, C\] without a batch axis"):
+        write_sequence(tmp_path, "a", make_sequence())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def dataset_on_disk(tmp_path):
+    write_sequence(tmp_path, "a", sequence(), first=8)
+    return write_dataset(tmp_path, {"train": ["a"]})
+
+
+def test_damaged_images_name_dataset_sequence_and_frame(dataset_on_disk):
+    root = dataset_on_disk.path
+    where = rf"dataset {root}, sequence a, frame 9: .*lr\.0009\.exr"
+    path = root / "a" / "lr.0009.exr"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=rf"{where}.*damaged"):
+        read_sequence(dataset_on_disk, "a")
+    path.write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(ValueError, match=rf"{where}: this is a Git LFS pointer"):
+        read_sequence(dataset_on_disk, "a")
+    path.unlink()
+    with pytest.raises(ValueError, match=rf"{where}: expected an EXR file, found nothing"):
+        read_sequence(dataset_on_disk, "a")
+    channels = {name: np.zeros((6, 9)) for name in ("color.R", "color.G", "color.B", "depth.Z")}
+    exr.write(path, channels)
+    with pytest.raises(ValueError, match=rf"{where}: expected the channels base_color\.B, .*motion\.X"):
+        read_sequence(dataset_on_disk, "a")
+    assert read_sequence(dataset_on_disk, "a", (10, 12)).frames.motion.shape[0] == 3
+
+
+def test_images_of_the_wrong_size_are_named(dataset_on_disk):
+    path = dataset_on_disk.path / "a" / "hr.0010.exr"
+    exr.write(path, {name: np.zeros((6, 9)) for name in "RGB"})
+    with pytest.raises(ValueError, match=r"frame 10: .*hr\.0010\.exr, channel [RGB]: expected 18x12 .* got 9x6"):
+        read_sequence(dataset_on_disk, "a")
+
+
+def test_damaged_metadata_is_named(dataset_on_disk):
+    root = dataset_on_disk.path
+    sequence_json, dataset_json = root / "a" / "sequence.json", root / "dataset.json"
+    content = json.loads(sequence_json.read_text())
+    del content["frames"][1]["jitter"]
+    sequence_json.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"sequence\.json, frame 9: 'jitter' is missing"):
+        read_sequence(read_dataset(root), "a")
+    sequence_json.write_text(json.dumps({"schema": 1}))
+    with pytest.raises(ValueError, match=r"sequence\.json: the fields name, width, .* are missing"):
+        read_dataset(root)
+    sequence_json.write_text(json.dumps({"schema": 2}))
+    with pytest.raises(ValueError, match=r"sequence\.json: expected schema 1, found 2"):
+        read_dataset(root)
+    sequence_json.write_text("{")
+    with pytest.raises(ValueError, match=r"sequence\.json: expected JSON, cannot read it"):
+        read_dataset(root)
+    sequence_json.unlink()
+    with pytest.raises(ValueError, match=r"sequence\.json: not found"):
+        read_dataset(root)
+    dataset_json.write_text(json.dumps({"schema": 1, "sequences": ["a"], "source": {}}))
+    with pytest.raises(ValueError, match=r"dataset\.json: a field is missing or has the wrong form .*splits"):
+        read_dataset(root)
+    dataset_json.write_text("[]")
+    with pytest.raises(ValueError, match="expected a JSON object, found a list"):
+        read_dataset(root)
+    dataset_json.unlink()
+    with pytest.raises(ValueError, match=r"dataset\.json: not found\. .*essjax scenes"):
+        read_dataset(root)
+
+
+def test_sequences_of_one_dataset_must_agree(tmp_path):
+    write_sequence(tmp_path, "a", sequence())
+    write_sequence(tmp_path, "b", sequence(W=10))
+    with pytest.raises(ValueError, match="must agree in width: a has 9, b has 10"):
+        write_dataset(tmp_path, {"train": ["a", "b"]})
+    with pytest.raises(ValueError, match=r"split test, sequence a: expected first <= score_from <= last within the "):
+        write_dataset(tmp_path, {"test": [Segment("a", 0, 9, 2)]})
+    with pytest.raises(ValueError, match=r"b/sequence\.json: not found|c/sequence\.json: not found"):
+        write_dataset(tmp_path, {"train": ["c"]})
+    with pytest.raises(ValueError, match="expected at least one sequence"):
+        write_dataset(tmp_path, {})
