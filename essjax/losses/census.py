@@ -13,6 +13,11 @@ GREY = (0.2989, 0.5870, 0.1140)
 """Rec. 601 luma, IFRNet's grey."""
 
 
+def _grey(color: Color) -> Plane:
+    red, green, blue = (weight * color[..., c : c + 1] for c, weight in enumerate(GREY))
+    return red + green + blue  # not a matrix product: some accelerators would round it
+
+
 def _soft_sign(difference: Array) -> Array:
     return difference / jnp.sqrt(0.81 + difference**2)
 
@@ -59,10 +64,7 @@ def census(prediction: Color, target: Color, *, window: int = 7) -> Plane:
     """
     check_same_shape(prediction, target)
     if prediction.shape[-1] == 3:
-        # Weighted by hand: a matrix product would run in reduced precision on some accelerators.
-        prediction, target = (
-            sum(weight * image[..., c : c + 1] for c, weight in enumerate(GREY)) for image in (prediction, target)
-        )
+        prediction, target = _grey(prediction), _grey(target)
     elif prediction.shape[-1] != 1:
         raise ValueError(
             f"census: expected 3 or 1 channels, got {prediction.shape[-1]}. Use feature_census for feature maps."

@@ -1,5 +1,7 @@
 """Structural similarity (Wang et al. 2004)."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,8 +22,10 @@ def _blur(image: Image, weights: np.ndarray) -> Image:
     Shifted sums: a depthwise convolution is slower on CPU, a banded matrix product less exact on accelerators.
     """
     height, width = (size - len(weights) + 1 for size in image.shape[-3:-1])
-    image = sum(float(weight) * image[..., dy : dy + height, :, :] for dy, weight in enumerate(weights))
-    return sum(float(weight) * image[..., dx : dx + width, :] for dx, weight in enumerate(weights))
+    rows = [float(weight) * image[..., dy : dy + height, :, :] for dy, weight in enumerate(weights)]
+    image = functools.reduce(jnp.add, rows)
+    columns = [float(weight) * image[..., dx : dx + width, :] for dx, weight in enumerate(weights)]
+    return functools.reduce(jnp.add, columns)
 
 
 def ssim_map(
@@ -47,10 +51,10 @@ def ssim_map(
             f"{prediction.shape[-2]}x{prediction.shape[-3]} pixels."
         )
     channels = prediction.shape[-1]
-    products = [prediction, target, prediction**2, target**2, prediction * target]
+    products = [prediction, target, prediction**2 + target**2, prediction * target]
     moments = _blur(jnp.concatenate(products, axis=-1), _gaussian_window(window, sigma))
-    mean_p, mean_t, square_p, square_t, cross = (moments[..., k * channels : (k + 1) * channels] for k in range(5))
-    variances = square_p - mean_p**2 + square_t - mean_t**2
+    mean_p, mean_t, squares, cross = (moments[..., k * channels : (k + 1) * channels] for k in range(4))
+    variances = squares - mean_p**2 - mean_t**2  # of both images together: the formula needs no more
     covariance = cross - mean_p * mean_t
     luminance = (2.0 * mean_p * mean_t + c1) / (mean_p**2 + mean_t**2 + c1)
     return luminance * (2.0 * covariance + c2) / (variances + c2)
