@@ -1,0 +1,160 @@
+"""The ``essjax`` command: make and import datasets. ``essjax --help`` lists the commands."""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from essjax.data import PRESETS, Dataset, ImportReport, import_dataset
+from essjax.generate import generate, plan
+
+_console = Console()
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar of frames; yields a function of (done, total)."""
+    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_console) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """``"128x72"`` as (width, height)."""
+    try:
+        width, height = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        width = height = 0
+    if width < 1 or height < 1:
+        raise ValueError(f"--size: expected WIDTHxHEIGHT such as 128x72, got {text!r}.")
+    return width, height
+
+
+def parse_range(text: str, option: str) -> tuple[int, int]:
+    """``"8:19"`` as (8, 19): first and last frame, both included."""
+    try:
+        first, last = (int(part) for part in text.split(":"))
+    except ValueError:
+        first, last = 0, -1
+    if last < first:
+        raise ValueError(f"{option}: expected FIRST:LAST such as 8:19, both included, got {text!r}.")
+    return first, last
+
+
+def _print_dataset(dataset: Dataset) -> None:
+    info = dataset.info
+    table = Table(title=f"{dataset.path}: {info.width}x{info.height} -> x{info.scale}", title_justify="left")
+    for column in ("split", "sequence", "frames", "scored from"):
+        table.add_column(column)
+    for split, segments in dataset.splits.items():
+        for segment in segments:
+            table.add_row(split, segment.sequence, f"{segment.first}-{segment.last}", str(segment.score_from))
+    _console.print(table)
+    _console.print(f"buffers: {', '.join(info.channels)}" + ("; native frames" if info.native else ""))
+
+
+def scenes(
+    out: tyro.conf.Positional[Path],
+    /,
+    split: Literal["train", "validation", "test"] = "train",
+    sequences: int = 2,
+    frames: int = 32,
+    size: str = "128x72",
+    scale: int = 2,
+    spp: int = 64,
+    families: str = "",
+    native: bool = False,
+    seed: int = 0,
+    mip_bias: float = 0.0,
+) -> None:
+    """Render built-in scenes into a dataset. Interrupted, the same command resumes; other splits can be added.
+
+    Args:
+      out: The dataset's folder.
+      split: Which seeds and families: those of different splits are disjoint.
+      sequences: Sequences per family.
+      frames: Frames per sequence.
+      size: Size of the rendered frames, WIDTHxHEIGHT.
+      scale: Size of the reference over that of the frames.
+      spp: Samples per pixel of the reference.
+      families: Only these, separated by commas; all of the split if empty.
+      native: Also 1-sample frames at the reference's size, the input of native TAA.
+      seed: Skip this many seeds of the split.
+      mip_bias: Texture filter, log2 of its width over an output pixel's.
+    """
+    width, height = parse_size(size)
+    chosen = [name.strip() for name in families.split(",")] if families else None
+    clips = plan(split, sequences, frames, spp=spp, families=chosen, start=seed)
+    with progress_bar("rendering") as progress:
+        dataset = generate(out, clips, width, height, scale=scale, native=native, mip_bias=mip_bias, progress=progress)
+    _print_dataset(dataset)
+
+
+def _print_report(report: ImportReport) -> None:
+    _print_dataset(report.dataset)
+    totals, table = report.totals, Table(title="conversion", title_justify="left", show_header=False)
+    table.add_row("frames", f"{report.sequence.numbers[0]}-{report.sequence.numbers[-1]}")
+    table.add_row("background", f"{totals['background'] / totals['pixels']:.1%} of pixels, masked; motion from cameras")
+    table.add_row("mixed silhouette pixels", f"{totals['mixed']}, motion from cameras")
+    table.add_row("negative colour values", f"{totals['negative']}, set to 0")
+    table.add_row("values beyond half's range", f"{totals['clamped']}, clamped")
+    table.add_row("objects that move", ", ".join(map(str, report.dynamic)) or "none found")
+    _console.print(table)
+
+
+def import_(
+    source: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    /,
+    preset: str = "blender",
+    train: str = "",
+    validation: str = "",
+    test: str = "",
+    name: str = "",
+) -> None:
+    """Import rendered frames into a dataset, converting their conventions. Interrupted, the same command resumes.
+
+    Args:
+      source: The folder as the renderer wrote it.
+      out: The dataset's folder.
+      preset: The producer's conventions: blender.
+      train: First and last frame to train on, such as 8:19; all three ranges or none (60, 10 and 30 % in order).
+      validation: First and last frame to validate on, streamed from the clip's start.
+      test: First and last frame to test on, streamed from the clip's start.
+      name: Name of the sequence; the folder's if empty.
+    """
+    given = {"train": train, "validation": validation, "test": test}
+    ranges = {split: parse_range(text, f"--{split}") for split, text in given.items() if text}
+    if preset not in PRESETS:
+        raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
+    with progress_bar("importing") as progress:
+        report = import_dataset(source, out, preset, splits=ranges or None, name=name or None, on_frame=progress)
+    _print_report(report)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"scenes": scenes, "import": import_}
+"""Command name -> function; its arguments and docstring are the command's."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; bad input prints one line and returns 2, Ctrl-C returns 130."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv)
+    except ValueError as error:
+        _console.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        return 2
+    except KeyboardInterrupt:
+        _console.print("interrupted; run the same command again to resume.")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

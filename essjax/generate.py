@@ -1,0 +1,179 @@
+"""Joins the built-in renderer and the dataset: render scenes to disk, resumably, or live into memory."""
+
+import functools
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import essjax.frames
+from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
+from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
+
+Progress = Callable[[int, int], Any]
+"""Called with (frames done, frames in all)."""
+
+
+class Clip(NamedTuple):
+    """One sequence to render.
+
+    Attributes:
+      split: "train", "validation" or "test".
+      family: of scenes.
+      seed: of the scene.
+      frames: how many.
+      spp: samples per pixel of the reference.
+    """
+
+    split: str
+    family: str
+    seed: int
+    frames: int
+    spp: int = 64
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence on disk."""
+        return f"{self.split}-{self.family}-{self.seed:04d}"
+
+
+def plan(
+    split: str, sequences: int, frames: int, *, spp: int = 64, families: Iterable[str] | None = None, start: int = 0
+) -> list[Clip]:
+    """Clips of a split: ``sequences`` of each of its families, interleaved; seeds of different splits are disjoint.
+
+    Args:
+      split: "train", "validation" or "test".
+      sequences: per family.
+      frames: per sequence.
+      spp: samples per pixel of the references.
+      families: only these; None: all families of the split.
+      start: skip this many seeds of the split.
+
+    Raises:
+      ValueError: unknown split or family, or nothing to render.
+    """
+    allowed = families_of(split)
+    chosen = tuple(allowed if families is None else families)
+    for family in chosen:
+        if family not in allowed:
+            hint = f" ({family} is in the test split only)" if family in FAMILIES else ""
+            raise ValueError(f"families: {split} has {', '.join(allowed)}; got {family!r}{hint}.")
+    clips = [
+        Clip(split, family, seed, frames, spp)
+        for family, seed in split_scenes(split, sequences, start=start)
+        if family in chosen
+    ]
+    if not clips:
+        raise ValueError(f"{split}: expected at least one sequence, got {sequences} of the families {chosen}.")
+    return clips
+
+
+def _check_request(out: Path, clips: Sequence[Clip], settings: dict) -> dict[str, list]:
+    """The splits that are there already; a ValueError where the request contradicts them."""
+    if len({clip.name for clip in clips}) != len(clips):
+        raise ValueError("generate: two clips have the same split, family and seed.")
+    if not (out / "dataset.json").is_file():
+        return {}
+    dataset = read_dataset(out)
+    for key, asked in settings.items():
+        found = dataset.source.get(key)
+        if found != asked:
+            raise ValueError(
+                f"{out}: this dataset was made with {key} = {found!r}, asked for {asked!r}. "
+                "Choose another output folder, or delete this one."
+            )
+    existing = {split: list(segments) for split, segments in dataset.splits.items()}
+    for split in {clip.split for clip in clips} & set(existing):
+        asked_names = {clip.name for clip in clips if clip.split == split}
+        missing = [segment.sequence for segment in existing[split] if segment.sequence not in asked_names]
+        if missing:
+            raise ValueError(
+                f"{out}: the split {split} already holds {', '.join(missing)}, which this request lacks. A split "
+                "can grow, not change: ask for the same sequences and more, or choose another output folder."
+            )
+    return existing
+
+
+def generate(
+    out: str | os.PathLike,
+    clips: Iterable[Clip],
+    width: int,
+    height: int,
+    *,
+    scale: int = 2,
+    native: bool = False,
+    mip_bias: float = 0.0,
+    progress: Progress = lambda done, total: None,
+) -> Dataset:
+    """Render clips into a dataset, frame by frame and atomically; running it again resumes.
+
+    Complete frames are kept, and so are splits that the dataset already has; a split may be asked for again with more
+    clips.
+
+    Args:
+      out: the dataset's folder.
+      clips: from ``plan``, of one split or several.
+      width: LR width, pixels.
+      height: LR height, pixels.
+      scale: reference size over frame size.
+      native: also frames at the reference's size (the input of native TAA).
+      mip_bias: texture filter, see ``scenes.render_frame``.
+      progress: called after each frame.
+
+    Raises:
+      ValueError: the folder holds data made with other settings, or a setting is invalid.
+    """
+    out, clips = Path(out), list(clips)
+    shared = {"renderer": "essjax.scenes", "width": width, "height": height, "scale": scale, "native": native}
+    shared["mip_bias"] = float(mip_bias)
+    splits: dict[str, list] = _check_request(out, clips, shared)
+    done, total = 0, sum(clip.frames for clip in clips)
+    for clip in clips:
+        scene = make_scene(clip.family, clip.seed, clip.frames)
+        writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
+        for index in range(clip.frames):
+            if index not in writer:
+                frame = render_frame(
+                    scene, index, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias
+                )
+                writer.write(
+                    index, frame.frames, frame.reference, valid=frame.valid, steady=frame.steady, native=frame.native
+                )
+            done += 1
+            progress(done, total)
+        writer.finish()
+    for split in {clip.split: None for clip in clips}:
+        splits[split] = [clip.name for clip in clips if clip.split == split]
+    return write_dataset(out, splits, source=shared)
+
+
+def live_source(
+    clips: Iterable[Clip],
+    width: int,
+    height: int,
+    *,
+    scale: int = 2,
+    native: bool = False,
+    mip_bias: float = 0.0,
+    on_frame: Callable[[int], Any] | None = None,
+) -> CachedSource:
+    """A source for ``data.clips`` that renders each clip when first asked for it, without touching the disk.
+
+    Args:
+      clips: from ``plan``.
+      width: LR width, pixels.
+      height: LR height, pixels.
+      scale: see ``generate``.
+      native: see ``generate``.
+      mip_bias: see ``generate``.
+      on_frame: called with the index of each finished frame of a clip.
+    """
+
+    def render(clip: Clip) -> essjax.frames.Sequence:
+        scene = make_scene(clip.family, clip.seed, clip.frames)
+        return render_sequence(
+            scene, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias, on_frame=on_frame
+        )
+
+    return CachedSource(functools.partial(render, clip) for clip in clips)
