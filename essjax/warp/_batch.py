@@ -27,7 +27,7 @@ def over_leading_axes(kernel: Callable, ranks: tuple[int, ...], *arrays: Array):
     return kernel(*arrays)
 
 
-def check_channels(name: str, array: Array, channels: int | None, size: tuple[int, int] | None = None) -> None:
+def check_channels(name: str, array: Array, channels: int | None, size: tuple[int, ...] | None = None) -> None:
     """Raise a ValueError unless ``array`` is ``[..., H, W, channels]``, with (H, W) = ``size`` where given."""
     shape = tuple(array.shape)
     fits = len(shape) >= 3 and channels in (None, shape[-1]) and size in (None, shape[-3:-1])

@@ -26,5 +26,5 @@ def backward_warp(image: Image, motion: Motion, *, mode: str = "bilinear", outsi
     """
     check_channels("image", image, None)
     check_channels("motion", motion, 2, image.shape[-3:-1])
-    positions = pixel_positions(*motion.shape[-3:-1]) + motion
+    positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + motion
     return sample(image, positions, mode=mode, outside=outside)

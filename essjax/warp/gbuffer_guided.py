@@ -22,10 +22,11 @@ WINNERS = 4
 SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
 """Base colour, normal: a starting value measured on a path-traced clip; the paper gives none."""
 SIGMA_DISTANCE = 4.0
-_ID_BITS = 6
-_ID_MASK = (1 << _ID_BITS) - 1
-_MAX_COST = np.float32(1e30)  # finite, so that a candidate that fits terribly still beats one outside the image
-_OUTSIDE = np.int32(0x7F800000)  # bits of +inf: above the key of every finite cost
+_ID_MASK = 63  # 6 bits hold a candidate's number
+_UNUSABLE = np.int32(0x7F800000)  # bits of +inf: above the key of every finite cost
+_REACH = max(STRIDES)
+_FAR = 1e6  # pixels; keeps integers from overflowing
+_ROWS_PER_BLOCK = 16
 
 
 def candidate_offsets() -> np.ndarray:
@@ -39,70 +40,83 @@ def guides(gbuffers: GBuffers) -> Image:
     return jnp.concatenate([gbuffers.base_color, gbuffers.normal], axis=-1)
 
 
-def _cost(guide_previous: list[Array], guide: list[Array], index: Array, away: list[Array], inverse: Array) -> Array:
-    """Minus the logarithm of eq 2's weight, without constants: half squared distances over variances."""
-    differences = [g - gather_pixels(p, index) for g, p in zip(guide, guide_previous, strict=True)]
-    squares = [0.5 * inverse[k] * d * d for k, d in enumerate([*differences, *away])]
-    total = jnp.asarray(sum(squares))
-    return jnp.where(total < _MAX_COST, total, _MAX_COST)  # NaN included: it would sort anywhere
-
-
-def _guided_one(
-    radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array
-) -> tuple[Array, Array, Array]:
-    height, width, channels = radiance.shape
+def _select(guide_previous: Array, guide: Array, x: Array, y: Array, inverse: Array) -> tuple[Array, ...]:
+    """Keys of the best candidates, four of ``[H, W]``, best first: cost bits with the candidate's number in the low 6."""
+    height, width, channels = guide.shape
+    # Costs are sums of squares of scaled differences. The border is +inf: a candidate there costs +inf and is never
+    # usable, without any comparison of positions. One plane per channel, as gathers of single numbers are cheapest.
+    scale = jnp.sqrt(0.5 * inverse)
+    margin = 2 * _REACH + 1
+    stride = width + 2 * margin
+    planes = [
+        jnp.pad(guide_previous[..., k] * scale[k], margin, constant_values=jnp.inf).reshape(-1) for k in range(channels)
+    ]
     offsets = jnp.asarray(candidate_offsets())
-    # Clamped far outside: every candidate is outside there anyway, and the integers below must not overflow.
-    reach = 4.0 * max(STRIDES)
+    steps = offsets[:, 1] * stride + offsets[:, 0]
+    # Beyond this clamp all candidates are outside already.
+    x, y = jnp.clip(x, -_REACH - 0.5, width + _REACH + 0.5), jnp.clip(y, -_REACH - 0.5, height + _REACH + 0.5)
+
+    def select_row(x, y, here):
+        column, row = jnp.floor(x), jnp.floor(y)
+        start = (row.astype(jnp.int32) + margin) * stride + column.astype(jnp.int32) + margin
+        fraction = (x - column - 0.5, y - row - 0.5)
+
+        def keep_best(candidate, best):
+            index = start + steps[candidate]
+            differences = [here[k] - gather_pixels(planes[k], index) for k in range(channels)]
+            away = [scale[channels + k] * (fraction[k] - offsets[candidate, k]) for k in range(2)]
+            cost = jnp.asarray(sum(d * d for d in [*differences, *away]))
+            bits = jax.lax.bitcast_convert_type(cost, jnp.int32) & ~_ID_MASK
+            key = jnp.where(cost < jnp.inf, bits, _UNUSABLE) | candidate  # NaN is unusable too
+            key = jax.lax.optimization_barrier(key)  # else XLA computes it again for each of the four minima
+            kept = []
+            for other in best:
+                kept.append(jnp.minimum(key, other))
+                key = jnp.maximum(key, other)
+            return tuple(kept)
+
+        worst = jnp.full(start.shape, np.iinfo(np.int32).max, jnp.int32)
+        return jax.lax.fori_loop(0, len(candidate_offsets()), keep_best, (worst,) * WINNERS)
+
+    here = jnp.moveaxis(guide * scale[:channels], -1, 1)  # [H, G, W]
+    # Blocks of rows stay in the cache during the 33 passes.
+    return jax.lax.map(lambda row: select_row(*row), (x, y, here), batch_size=_ROWS_PER_BLOCK)
+
+
+def _weigh(
+    guide_previous: Array, guide: Array, motion: Array, inverse: Array
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Weights and pixel numbers of the winners, four of ``[H, W]`` each; all that gradients pass through."""
+    height, width, channels = guide.shape
     target = pixel_positions(height, width) + motion
-    x = jnp.clip(target[..., 0].reshape(-1), -reach, width + reach)
-    y = jnp.clip(target[..., 1].reshape(-1), -reach, height + reach)
-    center_x, center_y = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
-    # One plane per channel: gathers of single numbers fuse, gathers of rows would be written out.
-    planes = [guide_previous[..., k].reshape(-1) for k in range(guide.shape[-1])]
-    here = [guide[..., k].reshape(-1) for k in range(guide.shape[-1])]
-
-    def locate(candidate):
-        offset = offsets[candidate]
-        column, row = center_x + offset[..., 0], center_y + offset[..., 1]
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        return jnp.clip(column, 0, width - 1), jnp.clip(row, 0, height - 1), inside
-
-    def cost(candidate, x, y, planes, here, inverse):
-        column, row, inside = locate(candidate)
-        away = [x - column - 0.5, y - row - 0.5]
-        return _cost(planes, here, row * width + column, away, inverse), inside
-
-    frozen = jax.lax.stop_gradient((x, y, planes, here, inverse))
-
-    def keep_best(candidate, best):
-        value, inside = cost(candidate, *frozen)
-        bits = jax.lax.bitcast_convert_type(value, jnp.int32)
-        key = jnp.where(inside, bits & ~_ID_MASK, _OUTSIDE) | candidate
-        kept = []
-        for other in best:
-            kept.append(jnp.minimum(key, other))
-            key = jnp.maximum(key, other)
-        return tuple(kept)
-
-    worst = jnp.full(x.shape, np.iinfo(np.int32).max, jnp.int32)
-    best = jax.lax.fori_loop(0, len(candidate_offsets()), keep_best, (worst,) * WINNERS)
-
+    x, y = target[..., 0], target[..., 1]
+    keys = _select(*jax.lax.stop_gradient((guide_previous, guide, x, y, inverse)))
+    center_x, center_y = (jnp.floor(jnp.clip(v, -_FAR, _FAR)).astype(jnp.int32) for v in (x, y))
+    flat = guide_previous.reshape(-1)
+    offsets = jnp.asarray(candidate_offsets())
     logits, pixels = [], []
-    for rank, key in enumerate(best):
-        candidate = key & _ID_MASK
-        value, _ = cost(jnp.minimum(candidate, len(candidate_offsets()) - 1), x, y, planes, here, inverse)
-        usable = key < _OUTSIDE
-        column, row, _ = locate(jnp.where(usable, candidate, 0))  # the centre, clamped: the nearest border pixel
-        # All 33 outside: the first takes it all. The constant replaces the value, so no gradient passes.
-        logits.append(jnp.where(usable, -value, 0.0 if rank == 0 else -jnp.inf))
-        pixels.append(row * width + column)
-    weights = jax.nn.softmax(jnp.stack(logits), axis=0)
-    flat = radiance.reshape(-1, channels)
-    blended = sum(w[:, None] * gather_pixels(flat, i).astype(jnp.float32) for w, i in zip(weights, pixels, strict=True))
-    result = blended.astype(radiance.dtype).reshape(radiance.shape)  # type: ignore[union-attr]
-    shape = (height, width, WINNERS)
-    return result, weights.T.reshape(shape), jnp.stack(pixels, axis=-1).reshape(shape)
+    for rank, key in enumerate(keys):
+        usable = key < _UNUSABLE
+        # Where nothing is usable this is the centre clamped to the image: the nearest border pixel.
+        candidate = jnp.where(usable, key & _ID_MASK, 0)
+        column = jnp.clip(center_x + offsets[candidate, 0], 0, width - 1)
+        row = jnp.clip(center_y + offsets[candidate, 1], 0, height - 1)
+        pixel = row * width + column
+        # Number by number: gathers of rows would be written out, these fuse.
+        apart = [guide[..., k] - gather_pixels(flat, pixel * channels + k) for k in range(channels)]
+        squares = [inverse[k] * d * d for k, d in enumerate([*apart, x - column - 0.5, y - row - 0.5])]
+        # With all 33 unusable the first takes everything. A constant replaces the cost, so no gradient passes.
+        logits.append(jnp.where(usable, -0.5 * jnp.asarray(sum(squares)), 0.0 if rank == 0 else -jnp.inf))
+        pixels.append(pixel)
+    return tuple(jax.nn.softmax(jnp.stack(logits), axis=0)), tuple(pixels)
+
+
+def _warp_one(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> Array:
+    weights, pixels = _weigh(guide_previous, guide, motion, inverse)
+    flat = radiance.reshape(-1, radiance.shape[-1])
+    values = [gather_pixels(flat, pixel).astype(jnp.float32) for pixel in pixels]
+    total = sum(weight[..., None] * value for weight, value in zip(weights, values, strict=True))
+    return jnp.asarray(total).astype(radiance.dtype)
 
 
 def _inverse_variances(sigma_guide, sigma_distance, channels: int) -> Array:
@@ -116,17 +130,16 @@ def _inverse_variances(sigma_guide, sigma_distance, channels: int) -> Array:
     return 1.0 / jnp.concatenate([jnp.broadcast_to(sigma_guide, (channels,)), distance]) ** 2
 
 
-def _run(radiance, guide_previous, guide, motion, sigma_guide, sigma_distance):
-    check_channels("radiance", radiance, None)
-    size = radiance.shape[-3:-1]
-    check_channels("guide", guide, None, size)
+def _run(kernel, images, guide_previous, guide, motion, sigma_guide, sigma_distance):
+    check_channels("guide", guide, None)
+    size = guide.shape[-3:-1]
+    for image in images:
+        check_channels("radiance", image, None, size)
     check_channels("guide_previous", guide_previous, guide.shape[-1], size)
     check_channels("motion", motion, 2, size)
     inverse = _inverse_variances(sigma_guide, sigma_distance, guide.shape[-1])
-    return over_leading_axes(
-        _guided_one, (3, 3, 3, 3, 1), radiance, guide_previous.astype(jnp.float32), guide.astype(jnp.float32), motion,
-        inverse,
-    )  # fmt: skip
+    arrays = (*images, guide_previous.astype(jnp.float32), guide.astype(jnp.float32), motion.astype(jnp.float32))
+    return over_leading_axes(kernel, (3,) * len(arrays) + (1,), *arrays, inverse)
 
 
 def gbuffer_guided_warp(
@@ -162,7 +175,7 @@ def gbuffer_guided_warp(
     Raises:
       ValueError: sizes differ, or ``sigma_guide`` is neither a number nor one per channel.
     """
-    return _run(radiance, guide_previous, guide, motion, sigma_guide, sigma_distance)[0]
+    return _run(_warp_one, (radiance,), guide_previous, guide, motion, sigma_guide, sigma_distance)
 
 
 def guided_weights(
@@ -179,5 +192,5 @@ def guided_weights(
       Weights ``[..., H, W, 4]``, sum 1, best first, and pixel numbers ``[..., H, W, 4]`` (row * W + column) in the
       previous frame; a number whose weight is 0 has no meaning.
     """
-    nothing = jnp.zeros((*motion.shape[-3:-1], 0))
-    return _run(nothing, guide_previous, guide, motion, sigma_guide, sigma_distance)[1:]
+    weights, pixels = _run(_weigh, (), guide_previous, guide, motion, sigma_guide, sigma_distance)
+    return jnp.stack(weights, axis=-1), jnp.stack(pixels, axis=-1)

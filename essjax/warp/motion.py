@@ -57,7 +57,7 @@ def compose_motion(
     if (jitter is None) != (jitter_previous is None):
         raise ValueError("compose_motion: expected both jitter and jitter_previous or neither, got one.")
     lookup = motion if jitter is None or jitter_previous is None else jittered_motion(motion, jitter, jitter_previous)
-    positions = pixel_positions(*motion.shape[-3:-1]) + lookup
+    positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + lookup
     total = motion + sample(previous, positions, mode=mode)
     valid = inside_mask(lookup) * inside_mask(total)
     if valid_previous is not None:

@@ -38,7 +38,7 @@ def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
     neighbour = dilate_motion(jnp.concatenate([splatted[..., :2], covered], axis=-1), depth_there)
     filled = jnp.where(covered > 0, splatted[..., :2], neighbour[..., :2])
     known = jnp.maximum(covered, neighbour[..., 2:])
-    positions = pixel_positions(*motion.shape[-3:-1]) + motion
+    positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + motion
     found = sample(jnp.concatenate([filled, known], axis=-1), positions, mode="nearest", outside="zeros")
     return jnp.where((hole < 0.5) & (found[..., 2:] > 0), found[..., :2], motion)
 
@@ -85,9 +85,9 @@ def hole_mask(
 ) -> Mask:
     """Where the previous frame showed the same surface: three conditions on G-buffers (ExtraNet eq 8-10; SPEC 2).
 
-    A pixel is a hole where the stencil differs; where it is dynamic (stencil > 0) and normals disagree; where it is static
-    and the world position moved by more than ``position_threshold`` footprints of a pixel, ``depth / (H * NoV)``, which
-    is scale-free (a vertical field of view near 53 degrees makes it exact); between sky and surface; off screen.
+    A pixel is a hole where the stencil differs; where it is dynamic (stencil > 0) and normals disagree; where it is
+    static and the world position moved by more than ``position_threshold`` footprints of a pixel, ``depth / (H * NoV)``,
+    which is scale-free (a vertical field of view near 53 degrees makes it exact); between sky and surface; off screen.
     Sky to sky is valid. The previous frame is compared at the up to four pixels that bilinear interpolation
     would read and the best match counts, so that thin things and silhouettes are not all holes.
 

@@ -76,7 +76,7 @@ def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Arra
     if mode == "nearest":  # no arithmetic: integers stay exact and +inf stays +inf
         value = gather_pixels(flat, rows[0].index * width + columns[0].index)
         return jnp.where((rows[0].weight * columns[0].weight)[..., None] > 0, value, jnp.zeros_like(value))
-    total = 0.0
+    total = jnp.zeros((), jnp.float32)
     for row in rows:
         for column in columns:
             value = gather_pixels(flat, row.index * width + column.index).astype(jnp.float32)
