@@ -1,0 +1,152 @@
+"""The loader: aligned, inside one shot, the same for the same seed, resumable."""
+
+import dataclasses
+import itertools
+
+import jax
+import numpy as np
+import pytest
+
+from essjax.data import CachedSource, clips, disk_source, write_dataset, write_sequence
+from essjax.data.loader import windows
+from essjax.frames import check_shapes
+from tests.helpers import make_sequence
+
+H, W, T = 8, 12, 9
+
+
+def coordinates(number: int, cuts=(0,), H=H, W=W, T=T):
+    """A sequence in which every colour says where it is: (x, y, 100 * sequence + frame), in LR pixels."""
+    base = jax.tree.map(lambda leaf: np.array(leaf[:, 0]), make_sequence(number, T, 1, H, W))
+
+    def grid(height, width):
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        frame = np.arange(T, dtype=np.float32)[:, None, None] + 100 * number
+        return np.stack(np.broadcast_arrays(x * W / width, y * H / height, frame), axis=-1).astype(np.float32)
+
+    cut = np.isin(np.arange(T), cuts)
+    frames = dataclasses.replace(base.frames, color=grid(H, W), cut=cut)
+    return dataclasses.replace(base, frames=frames, reference=grid(2 * H, 2 * W))
+
+
+def take(iterable, count):
+    return list(itertools.islice(iterable, count))
+
+
+def assert_same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_shapes_are_time_major_batches():
+    source = [coordinates(0), coordinates(1)]
+    clip = next(iter(clips(source, length=4, batch=3, crop=(5, 6))))
+    check_shapes(clip.frames)
+    assert clip.frames.color.shape == (4, 3, 5, 6, 3) and clip.reference.shape == (4, 3, 10, 12, 3)
+    assert clip.frames.jitter.shape == (4, 3, 2) and clip.frames.camera.camera_to_world.shape == (4, 3, 4, 4)
+    assert clip.valid.shape == (4, 3, 5, 6, 1) and clip.native is None
+    assert {leaf.dtype for leaf in jax.tree.leaves(clip)} == {np.dtype(t) for t in (np.float32, np.int32, bool)}
+    np.testing.assert_array_equal(clip.frames.cut, np.tile([[True], [False], [False], [False]], (1, 3)))
+
+
+def test_crops_and_flips_stay_aligned_with_the_reference():
+    """Both hold their coordinates: 2x2 blocks of the reference must average to those of the LR pixel + 1/4."""
+    source = [coordinates(0), coordinates(1)]
+    corners, directions = set(), set()
+    for clip in take(clips(source, length=3, batch=4, crop=(5, 7), seed=5), 12):
+        blocks = clip.reference.reshape(3, 4, 5, 2, 7, 2, 3).mean(axis=(3, 5))
+        np.testing.assert_allclose(
+            blocks - clip.frames.color, np.broadcast_to([0.25, 0.25, 0], blocks.shape), atol=1e-6
+        )
+        steps = np.diff(clip.frames.color[..., 2], axis=0)
+        np.testing.assert_array_equal(steps, np.ones_like(steps))
+        for b in range(4):
+            x, y = clip.frames.color[0, b, :, :, 0], clip.frames.color[0, b, :, :, 1]
+            corners.add((x.min(), y.min()))
+            directions.add((x[0, 1] - x[0, 0], y[1, 0] - y[0, 0]))
+    assert len(corners) > 10 and directions == {(1, 1), (-1, 1), (1, -1), (-1, -1)}
+
+
+def test_without_flips_and_crop_clips_are_windows_of_the_source():
+    source = [coordinates(0)]
+    for clip in take(clips(source, length=4, batch=2, flips=False), 5):
+        for b in range(2):
+            start = int(clip.frames.color[0, b, 0, 0, 2])
+            np.testing.assert_array_equal(clip.frames.motion[:, b], source[0].frames.motion[start : start + 4])
+            np.testing.assert_array_equal(clip.reference[:, b], source[0].reference[start : start + 4])
+
+
+def test_no_clip_crosses_a_cut():
+    """Cuts at 0 and 4 of 9 frames, length 3: starts 0, 1 and 4, 5, 6 (4 is a cut itself) by hand."""
+    source = [coordinates(0, cuts=(0, 4))]
+    assert windows(source, 3) == [(0, 0), (0, 1), (0, 4), (0, 5), (0, 6)]
+    seen = set()
+    for clip in take(clips(source, length=3, batch=1, flips=False), 10):
+        seen.add(int(clip.frames.color[0, 0, 0, 0, 2]))
+    assert seen == {0, 1, 4, 5, 6}
+
+
+def test_every_epoch_shows_every_window_once_in_another_order():
+    source = [coordinates(0), coordinates(1)]
+    starts = [int(c.frames.color[0, 0, 0, 0, 2]) for c in clips(source, length=6, batch=1, flips=False, epochs=2)]
+    everything = [100 * s + t for s in range(2) for t in range(4)]
+    assert sorted(starts[:8]) == sorted(starts[8:]) == everything
+    assert starts[:8] != starts[8:]
+
+
+def test_the_same_seed_gives_the_same_batches_whatever_the_threads():
+    source = [coordinates(0), coordinates(1)]
+    settings = {"length": 3, "batch": 2, "crop": (4, 5)}
+    one = take(clips(source, seed=7, threads=1, prefetch=1, **settings), 6)
+    assert_same(one, take(clips(source, seed=7, threads=4, prefetch=8, **settings), 6))
+    other = take(clips(source, seed=8, **settings), 6)
+    assert any(not np.array_equal(a.frames.color, b.frames.color) for a, b in zip(one, other, strict=True))
+
+
+def test_a_resumed_iterator_continues_exactly():
+    source = [coordinates(0), coordinates(1)]
+    make = lambda: iter(clips(source, length=3, batch=2, crop=(4, 5), seed=1))
+    iterator = make()
+    take(iterator, 3)
+    state = iterator.get_state()
+    expected = take(iterator, 5)
+    resumed = make()
+    resumed.set_state(state)
+    assert_same(take(resumed, 5), expected)
+
+
+def test_disk_and_memory_are_interchangeable(tmp_path):
+    """Colours are whole numbers, which half keeps exactly."""
+    for number in range(2):
+        write_sequence(tmp_path, f"s{number}", coordinates(number))
+    source = disk_source(write_dataset(tmp_path, {"train": ["s0", "s1"]}), "train")
+    settings = {"length": 3, "batch": 2, "crop": (4, 5), "seed": 1}
+    disk = next(iter(clips(source, **settings)))
+    memory = next(iter(clips([coordinates(0), coordinates(1)], **settings)))
+    np.testing.assert_array_equal(disk.frames.color, memory.frames.color)
+    np.testing.assert_array_equal(disk.frames.motion, memory.frames.motion)
+
+
+def test_a_cached_source_makes_each_sequence_once():
+    calls = []
+    source = CachedSource([lambda n=n: calls.append(n) or coordinates(n) for n in range(2)])
+    assert len(source) == 2 and calls == []
+    assert source[1] is source[1]
+    assert calls == [1] and [s.frames.color[0, 0, 0, 2] for s in source] == [0, 100]
+
+
+def test_errors():
+    source = [coordinates(0, cuts=(0, 4))]
+    with pytest.raises(ValueError, match="no 6 consecutive frames without a cut in 1 sequences .the longest has 9"):
+        clips(source, length=6, batch=1)
+    with pytest.raises(ValueError, match="a crop of 13x4 does not fit into sequence 0 of 12x8"):
+        clips(source, length=2, batch=1, crop=(4, 13))
+    with pytest.raises(ValueError, match=r"expected length >= 1 and batch >= 1, got 2 and 0"):
+        clips(source, length=2, batch=0)
+    with pytest.raises(ValueError, match="sequence 1 has another size than sequence 0. Give a crop"):
+        clips([coordinates(0), coordinates(1, H=9)], length=2, batch=1)
+    assert next(iter(clips([coordinates(0), coordinates(1, H=9)], length=2, batch=1, crop=(4, 4))))
+    bare = dataclasses.replace(coordinates(1), valid=None)
+    with pytest.raises(ValueError, match="sequence 1 has another scale or other buffers"):
+        clips([coordinates(0), bare], length=2, batch=1)
+    with pytest.raises(ValueError, match=r"expected sequences \[T, H, W, C\], got motion \(5, 2, 12, 18, 2\)"):
+        clips([make_sequence()], length=2, batch=1)
