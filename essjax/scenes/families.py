@@ -1,0 +1,62 @@
+"""The families of scenes: what they are called, what each shows, and which seeds belong to which split."""
+
+import zlib
+
+import numpy as np
+
+from essjax.scenes.builder import Builder, Scene
+from essjax.scenes.indoor import carousel, corridor, gloss
+from essjax.scenes.outdoor import cuts, grille, plaza, shadows, texture
+
+TRAIN_FAMILIES = ("corridor", "carousel", "grille", "gloss", "shadows", "texture")
+"""Families in every split: fast camera and large disocclusions; rigid and rotating objects; thin rods; mirror images in
+glossy floors; moving lights with hard shadows; high-frequency textures."""
+TEST_ONLY_FAMILIES = ("plaza", "cuts")
+"""Families in the test split only: sun, glowing signs and metal under an open sky; a camera that cuts."""
+FAMILIES = TRAIN_FAMILIES + TEST_ONLY_FAMILIES
+SPLITS = ("train", "validation", "test")
+
+_MAKERS = {
+    "corridor": corridor, "carousel": carousel, "grille": grille, "gloss": gloss, "shadows": shadows,
+    "texture": texture, "plaza": plaza, "cuts": cuts,
+}  # fmt: skip
+
+
+def make_scene(family: str, seed: int, frames: int) -> Scene:
+    """The scene of a family that belongs to ``seed``, animated over ``frames`` frames.
+
+    The first n frames do not depend on ``frames``.
+
+    Raises:
+      ValueError: unknown family, negative seed or no frames.
+    """
+    if family not in _MAKERS:
+        raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}.")
+    if seed < 0 or frames < 1:
+        raise ValueError(f"scene: expected seed >= 0 and frames >= 1, got seed {seed} and {frames} frames.")
+    rng = np.random.default_rng([zlib.crc32(family.encode()), seed])
+    builder = Builder(frames, rng)
+    _MAKERS[family](builder)
+    return builder.build(family, seed)
+
+
+def families_of(split: str) -> tuple[str, ...]:
+    """The families of a split: all of them in "test", ``TRAIN_FAMILIES`` in "train" and "validation"."""
+    if split not in SPLITS:
+        raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}.")
+    return FAMILIES if split == "test" else TRAIN_FAMILIES
+
+
+def split_seeds(split: str, count: int, *, start: int = 0) -> list[int]:
+    """``count`` seeds of a split, from its ``start``-th. Splits are disjoint: a seed modulo 3 is its split.
+
+    Raises:
+      ValueError: unknown split.
+    """
+    families_of(split)
+    return [3 * k + SPLITS.index(split) for k in range(start, start + count)]
+
+
+def split_scenes(split: str, sequences: int, *, start: int = 0) -> list[tuple[str, int]]:
+    """``(family, seed)`` of a split: ``sequences`` of each of its families, interleaved."""
+    return [(family, seed) for seed in split_seeds(split, sequences, start=start) for family in families_of(split)]

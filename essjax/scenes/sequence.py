@@ -1,0 +1,138 @@
+"""From a scene to the library's vocabulary: frames with all buffers, references and masks."""
+
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from essjax.cameras import Camera
+from essjax.frames import Frame, GBuffers, Sequence
+from essjax.scenes.builder import Scene
+from essjax.scenes.jitter import jitter_sequence
+from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
+from essjax.scenes.world import World
+from essjax.typing import Array, Callable
+
+_GBUFFERS = (
+    "base_color", "normal", "depth", "roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v",
+)  # fmt: skip
+
+
+def _camera(world: World, width: int, height: int) -> Camera:
+    return Camera(
+        camera_to_world=np.asarray(world.camera_to_world, np.float32),
+        focal=np.full(2, world.focal * width, np.float32),
+        center=np.array([0.5 * width, 0.5 * height], np.float32),
+    )
+
+
+def _check_size(width: int, height: int, scale: int, spp: int) -> None:
+    for name, value in (("width", width), ("height", height), ("scale", scale), ("spp", spp)):
+        if not (isinstance(value, (int, np.integer)) and value >= 1):
+            raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}.")
+
+
+def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray, angle: np.float32):
+    world, previous = scene.at(index), scene.before(index)
+    images = render_buffers(world, previous, width, height, jitter, angle)
+    if scene.cut[index]:  # nothing of the frame before can be used
+        images["valid"] = np.zeros_like(images["valid"])
+    frame = Frame(
+        color=images["color"],
+        gbuffers=GBuffers(**{name: images[name] for name in _GBUFFERS}),
+        motion=images["motion"],
+        jitter=jitter,
+        cut=np.asarray(scene.cut[index]),
+        exposure=np.float32(1.0),
+        camera=_camera(world, width, height),
+    )
+    return frame, images["valid"], images["steady"]
+
+
+def render_frame(
+    scene: Scene, index: int, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
+    mip_bias: float = 0.0,
+) -> Sequence:  # fmt: skip
+    """One frame of ``scene`` as a ``Sequence`` without time axis (leaves ``[H, W, C]``), NumPy arrays.
+
+    At a cut motion is that of a static scene seen by a static camera (zero) and ``valid`` is 0 everywhere.
+
+    Args:
+      scene: from ``make_scene``.
+      index: frame number; only it and the frame before matter, so rendering can start anywhere.
+      width: LR width, pixels.
+      height: LR height, pixels.
+      scale: reference size over frame size.
+      spp: samples per reference pixel.
+      native: also render 1-sample frames at the reference's size; their jitter advances every frame.
+      mip_bias: texture filter of LR and native frames, log2 of its width over an output pixel's: 0 is what
+        upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
+
+    Raises:
+      ValueError: a size is not a positive whole number, or there is no frame ``index``.
+    """
+    _check_size(width, height, scale, spp)
+    world = scene.at(index)
+    wide, high = width * scale, height * scale
+    angle = pixel_angle(world, wide, mip_bias)
+    frame, valid, steady = _frame(scene, index, width, height, jitter_sequence(index + 1)[index], angle)
+    native_frame = None
+    if native:
+        jitter = jitter_sequence(index + 1, every_frame=True)[index]
+        native_frame, _, _ = _frame(scene, index, wide, high, jitter, angle)
+    reference = render_reference(world, wide, high, spp=spp)
+    return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame)
+
+
+def iterate_frames(
+    scene: Scene, width: int, height: int, *, start: int = 0, stop: int | None = None, **settings
+) -> Iterator[tuple[int, Sequence]]:
+    """Yield ``(n, render_frame(scene, n, width, height, **settings))`` for n from ``start`` up to ``stop``.
+
+    For writers that store frame by frame and resume at frame ``start``.
+    """
+    for index in range(start, scene.frames if stop is None else stop):
+        yield index, render_frame(scene, index, width, height, **settings)
+
+
+def render_sequence(
+    scene: Scene, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
+    mip_bias: float = 0.0, on_frame: Callable[[int], None] | None = None,
+) -> Sequence:  # fmt: skip
+    """All frames of ``scene``: a ``Sequence`` whose leaves are ``[T, H, W, C]`` float32 NumPy arrays.
+
+    Args:
+      scene: from ``make_scene``.
+      width: LR width, pixels.
+      height: LR height, pixels.
+      scale: see ``render_frame``.
+      spp: see ``render_frame``.
+      native: see ``render_frame``.
+      mip_bias: see ``render_frame``.
+      on_frame: called with the index of each finished frame (progress bars).
+    """
+    parts = []
+    for index, part in iterate_frames(scene, width, height, scale=scale, spp=spp, native=native, mip_bias=mip_bias):
+        parts.append(part)
+        if on_frame is not None:
+            on_frame(index)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+
+
+def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, spp: int = 64) -> dict[str, Array]:
+    """Ranges over the samples of each output pixel: what classifier labels are made of (Guo et al. 2022, section 2).
+
+    Args:
+      scene: from ``make_scene``.
+      index: frame number.
+      width: output width (that of the reference), pixels.
+      height: output height, pixels.
+      spp: samples per pixel, those of the reference.
+
+    Returns:
+      ``depth_min``, ``depth_max`` ``[H, W, 1]`` (metres, +inf background), ``color_min``, ``color_max`` ``[H, W, 3]``,
+      ``normal_spread``, ``normal_spread_smooth`` ``[H, W, 1]``: largest L1 distance of a sample's normal to the first
+      sample's, with and without bump detail (the background's normal is 0).
+    """
+    _check_size(width, height, 1, spp)
+    return render_statistics(scene.at(index), width, height, spp=spp)
