@@ -54,11 +54,11 @@ def corridor(b: Builder) -> None:
         b.bar(presets.metal((0.75, 0.45, 0.3)), (-1.2, y, 14), (-1.2, y, -30), 0.06)
     for k in range(6):
         b.box(presets.lamp((1.0, 0.86, 0.66), 9.0), (0, height - 0.06, 4 - 5 * k), (0.5, 0.03, 0.12))
-    b.lamp((0.3, height - 0.4, 0.0), (16, 14, 11))
-    b.lamp((-0.4, height - 0.4, -12.0), (18, 13, 9))
-    forward, sway = swing(b, 6.0, rng.uniform(0.14, 0.2)), swing(b, 1.1, rng.uniform(0.05, 0.09))
-    eye = path(sway, 1.5 + swing(b, 0.25, 0.015), -2.0 + forward)
-    target = eye + path(swing(b, 0.45, 0.02), swing(b, 0.08, 0.006), -1.0)
+    b.lamp((0.3, height - 0.4, 0.0), (34, 29, 22))
+    b.lamp((-0.4, height - 0.4, -12.0), (38, 27, 18))
+    forward, sway = swing(b, 7.0, rng.uniform(0.22, 0.3)), swing(b, 1.2, rng.uniform(0.09, 0.14))
+    eye = path(sway, 1.5 + swing(b, 0.25, 0.02), -2.0 + forward)
+    target = eye + path(swing(b, 0.5, 0.035), swing(b, 0.08, 0.008), -1.0)
     b.set_camera(eye, target, focal=rng.uniform(0.75, 0.95))
 
 
@@ -109,19 +109,19 @@ def carousel(b: Builder) -> None:
         b.rod(
             presets.metal((0.8, 0.8, 0.82)), place * np.array([1, 0, 1]) + path(0, 1.5, 0), 0.03, 1.4, FLOOR, platform
         )
-    b.sun((rng.uniform(-0.6, 0.6), 1.0, rng.uniform(0.4, 0.9)), (2.6, 2.4, 2.1))
-    b.lamp((rng.uniform(-2, 2), 4.5, 3.0), (10, 9, 12))
-    angle = swing(b, 0.35, 0.012)
+    b.sun((rng.uniform(-0.6, 0.6), 1.0, rng.uniform(0.4, 0.9)), (5.4, 4.9, 4.2))
+    b.lamp((rng.uniform(-2, 2), 4.5, 3.0), (18, 16, 24))
+    angle = swing(b, 0.45, 0.03)
     eye = path(7.2 * np.sin(angle), 2.1 + swing(b, 0.3, 0.01), 7.2 * np.cos(angle))
-    b.set_camera(eye, path(swing(b, 0.5, 0.02), 1.35, 0.0), focal=rng.uniform(0.85, 1.0))
+    b.set_camera(eye, path(swing(b, 0.5, 0.04), 1.35, 0.0), focal=rng.uniform(0.85, 1.0))
 
 
 def gloss(b: Builder) -> None:
     """A hall with a polished floor: mirror images that move against the surface they appear on."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.bounces = 1
-    b.set_sky(zenith=(0.1, 0.2, 0.5), horizon=(0.9, 0.65, 0.5), clouds=0.62, ambient=0.4,
-              sun_direction=(rng.uniform(-0.5, 0.5), 0.25, -1.0), sun_color=(40, 28, 18), sun_size=0.003)  # fmt: skip
+    b.set_sky(zenith=(0.1, 0.2, 0.5), horizon=(1.3, 0.75, 0.45), clouds=0.62, ambient=0.4,
+              sun_direction=(rng.uniform(-0.5, 0.5), 0.25, -1.0), sun_color=(40, 28, 18), sun_size=0.0012)  # fmt: skip
     b.rect(
         presets.tiles((0.16, 0.17, 0.2), (0.05, 0.05, 0.06), frequency=0.9, mirror=0.7, roughness=0.2),
         (0, 0, -4),
@@ -157,7 +157,7 @@ def gloss(b: Builder) -> None:
             b.box(presets.decorated(rng, color, colors[(k + 2) % 5], detail=1.2), place, (size, size, size), own)
         else:
             b.sphere(presets.checker(color, (0.9, 0.9, 0.86), frequency=2.5), place, size, own)
-    b.sun((rng.uniform(-0.5, 0.5), 0.8, 0.5), (2.4, 2.1, 1.8))
-    b.lamp((0, 3.4, -4.0), (10, 8, 7))
-    eye = path(swing(b, 1.6, rng.uniform(0.05, 0.08)), 1.3 + swing(b, 0.3, 0.012), 4.2 + swing(b, 1.5, 0.05))
-    b.set_camera(eye, path(swing(b, 0.8, 0.03), 1.15, -4.0), focal=rng.uniform(0.85, 1.0))
+    b.sun((rng.uniform(-0.5, 0.5), 0.8, 0.5), (5.5, 4.6, 3.6))
+    b.lamp((0, 3.4, -4.0), (20, 15, 12))
+    eye = path(swing(b, 1.9, rng.uniform(0.12, 0.18)), 1.3 + swing(b, 0.3, 0.02), 4.2 + swing(b, 1.5, 0.08))
+    b.set_camera(eye, path(swing(b, 1.2, 0.1), 1.15, -4.0), focal=rng.uniform(0.85, 1.0))

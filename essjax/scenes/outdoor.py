@@ -41,9 +41,9 @@ def grille(b: Builder) -> None:
         b.sphere(
             presets.decorated(rng, colors[k], colors[k - 1], detail=1.2), run, size, rotation("z", turning(b, 0.12))
         )
-    b.sun((-0.5, 0.9, 0.35), (3.0, 2.8, 2.4))
-    eye = path(swing(b, 1.8, rng.uniform(0.07, 0.1)), 1.25 + swing(b, 0.2, 0.01), 3.6 + swing(b, 0.5, 0.02))
-    b.set_camera(eye, path(swing(b, 0.6, 0.03), 1.3, -3.0), focal=rng.uniform(0.8, 0.95))
+    b.sun((-0.5, 0.9, 0.35), (6.0, 5.5, 4.6))
+    eye = path(swing(b, 2.0, rng.uniform(0.15, 0.2)), 1.25 + swing(b, 0.2, 0.02), 3.6 + swing(b, 0.5, 0.04))
+    b.set_camera(eye, path(swing(b, 1.0, 0.1), 1.3, -3.0), focal=rng.uniform(0.8, 0.95))
 
 
 def shadows(b: Builder) -> None:
@@ -63,12 +63,12 @@ def shadows(b: Builder) -> None:
         size, tall = rng.uniform(0.3, 0.6), rng.uniform(0.5, 1.6)
         spot = (-4.0 + 1.1 * k + rng.uniform(-0.3, 0.3), tall, rng.uniform(-4.5, 0.8))
         b.box(
-            presets.decorated(rng, colors[k % 5], colors[k - 2]),
+            presets.decorated(rng, colors[k % 5], colors[(k + 3) % 5]),
             spot,
             (size, tall, size),
             rotation("y", rng.uniform(0, 3)),
         )
-    for k in range(10):
+    for _ in range(10):
         x, z = rng.uniform(-4.5, 4.5), rng.uniform(-4.0, 1.2)
         b.bar(presets.metal((0.75, 0.7, 0.6)), (x, 0, z), (x + rng.uniform(-0.5, 0.5), rng.uniform(1.5, 3.2), z), 0.05)
     for _ in range(5):
@@ -77,14 +77,14 @@ def shadows(b: Builder) -> None:
     for k in range(8):
         b.box(presets.planks(presets.shade(colors[3], 0.7)), (-3.5 + k, 3.4, -1.0), (0.09, 0.09, 3.0))
     day = swing(b, 0.9, rng.uniform(0.02, 0.035))
-    b.sun(path(np.sin(day) + 0.2, 0.9, 0.55 + 0.3 * np.cos(day)), (3.0, 2.7, 2.2))
+    b.sun(path(np.sin(day) + 0.2, 0.9, 0.55 + 0.3 * np.cos(day)), (6.5, 5.6, 4.4))
     fly = turning(b, rng.uniform(0.05, 0.08))
     place = path(2.6 * np.sin(fly), 2.4 + 0.4 * np.sin(2.3 * fly), -1.2 + 2.2 * np.cos(fly))
-    b.lamp(place, (7, 9, 14))
+    b.lamp(place, (14, 19, 30))
     b.sphere(presets.lamp((0.6, 0.8, 1.0), 25.0), place + path(0, 0.13, 0), 0.1)
-    angle = swing(b, 0.5, 0.014)
+    angle = swing(b, 0.5, 0.026)
     eye = path(6.8 * np.sin(angle), 2.4 + swing(b, 0.3, 0.01), 6.6 * np.cos(angle))
-    b.set_camera(eye, path(swing(b, 0.3, 0.012), 1.1, -1.0), focal=rng.uniform(0.85, 1.0))
+    b.set_camera(eye, path(swing(b, 0.5, 0.04), 1.1, -1.0), focal=rng.uniform(0.85, 1.0))
 
 
 def texture(b: Builder) -> None:
@@ -112,9 +112,9 @@ def texture(b: Builder) -> None:
         size = rng.uniform(0.35, 0.6)
         place = path(-3 + 2 * k + swing(b, 0.8, 0.05), size + 0.1 + np.abs(swing(b, 0.5, 0.03)), 0.3 - 0.2 * k)
         b.sphere(makers[(k + 3) % 8](), place, size, rotation("y", turning(b, rng.uniform(-0.06, 0.06))))
-    b.sun((rng.uniform(-0.7, 0.7), 1.0, 0.8), (3.0, 2.8, 2.5))
-    eye = path(swing(b, 3.0, rng.uniform(0.07, 0.11)), 1.3 + swing(b, 0.25, 0.012), 3.2 + swing(b, 0.8, 0.03))
-    b.set_camera(eye, path(0.6 * eye[:, 0] + swing(b, 0.5, 0.02), 1.15, -3.0), focal=rng.uniform(0.85, 1.0))
+    b.sun((rng.uniform(-0.7, 0.7), 1.0, 0.8), (6.0, 5.5, 4.8))
+    eye = path(swing(b, 3.0, rng.uniform(0.16, 0.22)), 1.3 + swing(b, 0.25, 0.02), 3.2 + swing(b, 0.8, 0.05))
+    b.set_camera(eye, path(0.5 * eye[:, 0] + swing(b, 0.8, 0.05), 1.15, -3.0), focal=rng.uniform(0.85, 1.0))
 
 
 def _square(b: Builder, colors) -> None:
@@ -140,7 +140,7 @@ def _square(b: Builder, colors) -> None:
         )
     for k in range(6):
         angle = 2 * np.pi * k / 6 + 0.4
-        spot = np.array([5.2 * np.sin(angle), 0.0, 5.2 * np.cos(angle)])
+        spot = np.array([4.4 * np.sin(angle), 0.0, 4.4 * np.cos(angle)])
         b.bar(presets.paint((0.06, 0.07, 0.08)), spot, spot + (0, 2.6, 0), 0.05)
         b.sphere(presets.lamp((1.0, 0.85, 0.6), 14.0), spot + (0, 2.7, 0), 0.16)
     for k in range(16):
@@ -170,17 +170,17 @@ def plaza(b: Builder) -> None:
     b.bounces = 1
     sun = (rng.uniform(-0.4, 0.4), 0.32, -1.0)
     b.set_sky(zenith=(0.12, 0.25, 0.6), horizon=(1.1, 0.75, 0.5), clouds=0.66, ambient=0.45, sun_direction=sun,
-              sun_color=(120, 80, 45), sun_size=0.002)  # fmt: skip
+              sun_color=(120, 80, 45), sun_size=0.0008)  # fmt: skip
     _square(b, colors)
     b.box(
         presets.tiles((0.05, 0.09, 0.1), (0.03, 0.05, 0.06), frequency=1.5, mirror=0.9, roughness=0.15),
         (0, 0.03, 2.6),
         (2.6, 0.03, 1.3),
     )
-    b.sun(sun, (3.6, 2.7, 1.9))
-    angle = swing(b, 0.5, rng.uniform(0.014, 0.02))
-    eye = path(6.4 * np.sin(angle), 1.7 + swing(b, 0.3, 0.012), 6.4 * np.cos(angle) + swing(b, 0.8, 0.04))
-    b.set_camera(eye, path(swing(b, 1.0, 0.04), 1.6, -2.0), focal=rng.uniform(0.75, 0.9))
+    b.sun(sun, (8.0, 5.4, 3.4))
+    angle = swing(b, 0.5, rng.uniform(0.028, 0.04))
+    eye = path(7.2 * np.sin(angle), 1.7 + swing(b, 0.3, 0.012), 7.2 * np.cos(angle) + swing(b, 0.8, 0.04))
+    b.set_camera(eye, path(swing(b, 1.5, 0.1), 1.6, -2.0), focal=rng.uniform(0.75, 0.9))
 
 
 def cuts(b: Builder) -> None:
@@ -188,7 +188,7 @@ def cuts(b: Builder) -> None:
     rng, colors = b.rng, presets.palette(b.rng)
     b.set_sky(clouds=0.68, ambient=0.6, sun_direction=(0.5, 0.7, 0.4), sun_color=(60, 56, 48))
     _square(b, colors)
-    b.sun((0.5, 0.9, 0.4), (3.2, 3.0, 2.7))
+    b.sun((0.5, 0.9, 0.4), (6.0, 5.6, 5.0))
     shots = []
     for k in range(4):
         angle = rng.uniform(0, 2 * np.pi) + (1 if k % 2 else -1) * rng.uniform(0.012, 0.022) * np.arange(b.frames)

@@ -17,9 +17,9 @@ PALETTES: tuple[tuple[Rgb, ...], ...] = (
 
 
 def palette(rng: np.random.Generator) -> list[Rgb]:
-    """One of ``PALETTES`` in random order."""
-    colors = PALETTES[rng.integers(len(PALETTES))]
-    return [colors[k] for k in rng.permutation(len(colors))]
+    """One of ``PALETTES`` in random order, more saturated: tone mapping takes some of it away again."""
+    colors = np.asarray(PALETTES[rng.integers(len(PALETTES))]) ** 1.5
+    return [(float(r), float(g), float(b)) for r, g, b in rng.permutation(colors)]
 
 
 def shade(color: Rgb, factor: float) -> Rgb:
