@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -144,14 +145,19 @@ def _lr(dump: _Dump, number: int) -> _Passes:
     return _Passes(dump.folder / f"lr.{number:04d}.exr", dump.width, dump.height)
 
 
+@jax.jit
+def _static_motion(camera: Camera, previous: Camera, jitter: jax.Array, depth: jax.Array) -> jax.Array:
+    height, width = depth.shape[:2]
+    return static_motion(camera, previous, pixel_positions(height, width, jitter), depth)
+
+
 def _motions(dump: _Dump, passes: _Passes, number: int, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Motion as rendered, ``previous = current + (X, -Y)``, and that of a static world; both 0 in the first frame."""
     vector = passes.get("Vector", "XY") * np.array([1.0, -1.0], np.float32)
     if number - 1 not in dump.cameras:
         return np.zeros_like(vector), np.zeros_like(vector)
     camera, previous = dump.cameras[number], dump.cameras[number - 1]
-    positions = pixel_positions(dump.height, dump.width, jnp.asarray(dump.jitters[number]))
-    return vector, np.asarray(static_motion(camera, previous, positions, jnp.asarray(depth)))
+    return vector, np.asarray(_static_motion(camera, previous, dump.jitters[number], depth))
 
 
 def _depth(passes: _Passes) -> np.ndarray:
