@@ -27,13 +27,14 @@ def print_table(
       console: where to print; the terminal if None.
     """
     console = console or Console()
+    unlimited = console.options.update(width=1000)
     for resolution in resolutions(metrics):
         table = make_table(metrics, resolution, sequence, references)
         if not table.lines:
             continue
         for count in range(len(COLUMNS), 0, -1):  # the widest that fits: cut numbers help nobody
             grid = _grid(table, count)
-            if console.measure(grid).maximum <= console.width:
+            if console.measure(grid, options=unlimited).maximum <= console.width:
                 break
         console.print(table.title, style="bold", highlight=False)
         console.print(grid)
