@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.scenes.vec import Vec, dot, larger, normalize, smaller
-from essjax.scenes.world import BOX, OFFSET, RECT, ROD, SPHERE, World
+from essjax.scenes.world import BOX, CAPACITY, OFFSET, RECT, ROD, ROW_KIND, ROW_MEMBER, SPHERE, World
 from essjax.typing import Array, Callable, Float, Int
 
 FAR = 1e9
@@ -80,23 +80,66 @@ def _rod(o: Vec, d: Vec) -> Array:
 _SHAPES = ((RECT, _rect), (BOX, _box), (SPHERE, _sphere), (ROD, _rod))
 
 
-def _nearest(world: World, kind: int, shape: Callable, origin: Vec, direction: Vec, best: tuple) -> tuple:
-    def body(index, best):
+def _lane_sum(values: Array) -> Array:
+    return values.reshape(-1, 128).sum(axis=0).sum() if values.shape[0] % 128 == 0 else values.sum()
+
+
+def _lane_max(values: Array) -> Array:
+    return values.reshape(-1, 128).max(axis=0).max() if values.shape[0] % 128 == 0 else values.max()
+
+
+def _candidates(world: World, origin: Vec, direction: Vec, active: Array) -> tuple[Array, list[Array]]:
+    """Rows that any of the active rays may hit, and how many of each kind: order ``[P]``, counts.
+
+    All rays start in a ball and point into a cone about their mean direction; a primitive is left out when its bounding
+    sphere touches neither. Neighbouring pixels traced together meet a fraction of the scene's primitives.
+    """
+    count = larger(_lane_sum(jnp.where(active, 1.0, 0.0)), 1.0)
+    mean = lambda v: _lane_sum(jnp.where(active, v, 0.0)) / count
+    centre = Vec(x=mean(origin.x), y=mean(origin.y), z=mean(origin.z))
+    axis = normalize(Vec(x=mean(direction.x), y=mean(direction.y), z=mean(direction.z)))
+    away = origin - centre
+    ball = jnp.sqrt(_lane_max(jnp.where(active, dot(away, away), 0.0))) + 1e-3
+    cosine = 1.0 - _lane_max(jnp.where(active, 1.0 - dot(direction, axis), 0.0)) - 1e-5
+    sine = jnp.sqrt(larger(1.0 - cosine * cosine, 0.0))
+
+    affine = world.to_world.reshape(-1, 3, 4)
+    half = jnp.sqrt((affine[:, :, :3] ** 2).sum(axis=1))
+    kind = jnp.asarray(ROW_KIND)
+    radius = jnp.where(kind == SPHERE, half.max(axis=-1), jnp.sqrt((half**2).sum(axis=-1)))
+    reach = radius * 1.001 + ball
+    to = Vec(x=affine[:, 0, 3] - centre.x, y=affine[:, 1, 3] - centre.y, z=affine[:, 2, 3] - centre.z)
+    along = dot(to, axis)
+    across = jnp.sqrt(larger(dot(to, to) - along * along, 0.0))
+    met = (across * cosine - along * sine <= reach) & (along >= -reach)
+    used = jnp.asarray(ROW_MEMBER) < world.counts[kind]
+    keep = used & (met | (cosine < 0.1)) & jnp.any(active)
+    order = jnp.argsort(jnp.where(keep, 2 * kind, 2 * kind + 1)).astype(jnp.int32)
+    return order, [jnp.sum((keep & (kind == k)).astype(jnp.int32)) for k in range(len(CAPACITY))]
+
+
+def _nearest(table: Array, order: Array, count: Array, kind: int, shape: Callable, ray: tuple, best: tuple) -> tuple:
+    def body(member, best):
         distance, row = best
-        matrix = jax.lax.dynamic_index_in_dim(world.to_local, index, keepdims=False)
+        index = order[OFFSET[kind] + member]
+        matrix = jax.lax.dynamic_index_in_dim(table, index, keepdims=False)
         m = [matrix[k] for k in range(12)]
-        t = shape(_transform_point(m, origin), _transform_direction(m, direction))
+        t = shape(_transform_point(m, ray[0]), _transform_direction(m, ray[1]))
         closer = t < distance
         return jnp.where(closer, t, distance), jnp.where(closer, index, row)
 
-    return jax.lax.fori_loop(OFFSET[kind], OFFSET[kind] + world.counts[kind], body, best)
+    return jax.lax.fori_loop(0, count, body, best)
 
 
 def trace(world: World, origin: Vec, direction: Vec, limit: Float[Array, "N"]) -> tuple[Array, Int[Array, "N"]]:
-    """Nearest hit closer than ``limit`` (metres): distance ``[N]`` and table row ``[N]``, -1 where nothing is hit."""
+    """Nearest hit closer than ``limit`` (metres): distance ``[N]`` and table row ``[N]``, -1 where nothing is hit.
+
+    Rays whose limit is 0 cost nothing where all of them have it; rays that lie close together cost less.
+    """
+    order, counts = _candidates(world, origin, direction, limit > 0.0)
     best = (limit, jnp.full(limit.shape, -1, jnp.int32))
     for kind, shape in _SHAPES:
-        best = _nearest(world, kind, shape, origin, direction, best)
+        best = _nearest(world.to_local, order, counts[kind], kind, shape, (origin, direction), best)
     return best
 
 

@@ -16,7 +16,7 @@ from essjax.scenes import geometry
 from essjax.scenes.jitter import reference_samples
 from essjax.scenes.materials import Surface, surface
 from essjax.scenes.shading import direct, environment, mirror_weight, radiance
-from essjax.scenes.vec import Vec, dot, normalize, stack
+from essjax.scenes.vec import Vec, dot, normalize, select, stack
 from essjax.scenes.world import World, column
 from essjax.typing import Array, Callable, Float
 
@@ -50,36 +50,26 @@ def screen_position(world: World, offset: Vec) -> tuple[Array, Array]:
 
 
 @jax.jit
-def average_color(world: World, x: Array, y: Array, dx: Array, dy: Array, angle: Array) -> Float[Array, "N 3"]:
-    """Mean radiance over the samples ``(dx, dy)`` ``[S]`` around each screen position ``(x, y)`` ``[N]``."""
-    origin, direction, _ = primary_rays(world, (x[None] + dx[:, None]).ravel(), (y[None] + dy[:, None]).ravel())
-    color = stack(radiance(world, origin, direction, angle))
-    return color.reshape(dx.shape[0], x.shape[0], 3).mean(axis=0)
+def color_along(world: World, x: Array, y: Array, angle: Array) -> Float[Array, "N 3"]:
+    """Radiance at the screen positions ``(x, y)`` ``[N]``; ``angle`` of a pixel (radians) filters the textures."""
+    origin, direction, _ = primary_rays(world, x, y)
+    return stack(radiance(world, origin, direction, angle))
 
 
-def _shade_without_mirror(world: World, s: Surface, direction: Vec) -> Array:
-    return stack(direct(world, s, -direction) + environment(world, s, direction) + s.emission)
-
-
-def _follow(world: World, previous: World, s: Surface, direction: Vec) -> tuple[Vec, Vec, Array, Array]:
-    """Ray of the previous frame towards the same material point (sky: direction), its length, whether it sees it."""
+def _follow(previous: World, s: Surface, direction: Vec) -> tuple[Vec, Vec, Array]:
+    """Ray of the previous frame towards the same material point (sky: direction), and its length."""
     _, eye = _camera(previous)
     there = geometry.to_world(previous, s.row, s.local) - eye
     distance = jnp.where(s.hit, jnp.sqrt(dot(there, there)), geometry.FAR)
-    towards = normalize(Vec(x=jnp.where(s.hit, there.x, direction.x), y=jnp.where(s.hit, there.y, direction.y),
-                            z=jnp.where(s.hit, there.z, direction.z)))  # fmt: skip
-    origin = eye + towards * 0.0
-    t, row = geometry.trace(previous, origin, towards, jnp.full_like(distance, geometry.FAR))
-    near = jnp.abs(t - distance) < 2e-3 * distance + 5e-3
-    seen = jnp.where(s.hit, (row == s.row) & near, row < 0)
-    return origin, towards, distance, seen
+    towards = normalize(select(s.hit, there, direction))
+    return eye + towards * 0.0, towards, distance
 
 
 @jax.jit
 def buffers(
     world: World, previous: World, x: Array, y: Array, half_height: Array, angle: Array
 ) -> dict[str, Float[Array, "N C"]]:
-    """Everything a frame holds at the screen positions ``(x, y)`` ``[N]``; motion in image widths.
+    """Everything a frame holds but colour, at the screen positions ``(x, y)`` ``[N]``; motion in image widths.
 
     Args:
       world: the scene now.
@@ -90,59 +80,64 @@ def buffers(
       angle: ``[]`` pixel angle for the texture filter, radians.
     """
     origin, direction, cosine = primary_rays(world, x, y)
-    t, row = geometry.trace(world, origin, direction, jnp.full_like(x, geometry.FAR))
-    s = surface(world, row, origin, direction, t, t * angle)
-    previous_origin, towards, distance, seen = _follow(world, previous, s, direction)
+
+    # Now and then are two rounds of one scan, not two copies of the ray caster: half the compile time.
+    def instant(carry, step):
+        origin, direction, known, known_row, first = carry
+        then, scene = step
+        t, row = geometry.trace(scene, origin, direction, jnp.full_like(x, geometry.FAR))
+        expected, expected_row = jnp.where(then, known, t), jnp.where(then, known_row, row)
+        near = jnp.abs(t - expected) < 2e-3 * expected + 5e-3
+        seen = jnp.where(expected_row >= 0, (row == expected_row) & near, row < 0)
+        first = jnp.where(then, first, t)
+        s = surface(scene, expected_row, origin, direction, expected, first * angle)
+        shade = stack(direct(scene, s, -direction) + environment(scene, s, direction) + s.emission)
+        back = _follow(previous, s, direction)
+        return (*back, expected_row, first), (s, shade, seen, t, back[1])
+
+    start = (origin, direction, x * 0.0, jnp.zeros(x.shape, jnp.int32), x * 0.0)
+    worlds = jax.tree.map(lambda a, b: jnp.stack([a, b]), world, previous)
+    _, (surfaces, shades, seen, distances, rays) = jax.lax.scan(instant, start, (jnp.array([False, True]), worlds))
+    s, towards, t = jax.tree.map(lambda leaf: leaf[0], (surfaces, rays, distances))
+
     previous_x, previous_y = screen_position(previous, towards)
     (_, _, back), _ = _camera(previous)
     on_screen = (jnp.abs(previous_x) <= 0.5) & (jnp.abs(previous_y) <= half_height) & (dot(back, towards) < -1e-3)
-
-    before = surface(previous, row, previous_origin, towards, distance, t * angle)
-    now = _shade_without_mirror(world, s, direction)
-    then = _shade_without_mirror(previous, before, towards)
-    change = jnp.max(jnp.abs(now / (1.0 + now) - then / (1.0 + then)), axis=-1)
+    toned = shades / (1.0 + shades)
+    change = jnp.max(jnp.abs(toned[0] - toned[1]), axis=-1)
     mirror = mirror_weight(s, direction)
     is_mirror = (s.mirror > 0.0) & (jnp.maximum(jnp.maximum(mirror.x, mirror.y), mirror.z) > 0.02)
     steady = ~s.hit | ((change < STEADY_TOLERANCE) & ~is_mirror)
 
     hit = s.hit[:, None]
     one = lambda value: jnp.where(hit, value[:, None], 0.0)
+    three = lambda value: jnp.where(hit, stack(value), 0.0)
     return {
-        "color": stack(radiance(world, origin, direction, angle)),
-        "base_color": jnp.where(hit, stack(s.base_color), 0.0),
-        "normal": jnp.where(hit, stack(s.normal), 0.0),
+        "base_color": three(s.base_color),
+        "normal": three(s.normal),
+        "smooth_normal": three(s.smooth_normal),
         "depth": jnp.where(hit, (t * cosine)[:, None], jnp.inf),
         "roughness": one(s.roughness),
         "metallic": one(s.metallic),
         "specular": one(s.specular),
-        "world_position": jnp.where(hit, stack(s.position), 0.0),
-        "stencil": one(column(world, row, "id")),
+        "world_position": three(s.position),
+        "stencil": one(column(world, s.row, "id")),
         "n_dot_v": one(s.n_dot_v),
         "motion": jnp.stack([previous_x - x, previous_y - y], axis=-1),
-        "valid": (seen & on_screen).astype(jnp.float32)[:, None],
+        "valid": (seen[1] & on_screen).astype(jnp.float32)[:, None],
         "steady": steady.astype(jnp.float32)[:, None],
     }
 
 
 @jax.jit
-def sample_statistics(world: World, x: Array, y: Array, dx: Array, dy: Array, angle: Array) -> dict[str, Array]:
-    """Ranges over the samples ``(dx, dy)`` ``[S]`` of each pixel: what ``sequence.subsample_statistics`` returns."""
-    shape = (dx.shape[0], x.shape[0])
-    origin, direction, cosine = primary_rays(world, (x[None] + dx[:, None]).ravel(), (y[None] + dy[:, None]).ravel())
-    t, row = geometry.trace(world, origin, direction, jnp.full_like(direction.x, geometry.FAR))
+def normals_and_depth(world: World, x: Array, y: Array, angle: Array) -> tuple[Array, Array, Array]:
+    """Normal with and without bump detail ``[N, 3]`` (0 where nothing is hit) and depth ``[N, 1]``."""
+    origin, direction, cosine = primary_rays(world, x, y)
+    t, row = geometry.trace(world, origin, direction, jnp.full_like(x, geometry.FAR))
     s = surface(world, row, origin, direction, t, t * angle)
-    depth = jnp.where(s.hit, t * cosine, jnp.inf).reshape(*shape, 1)
-    color = stack(radiance(world, origin, direction, angle)).reshape(*shape, 3)
-
-    def spread(normal: Vec) -> Array:
-        normals = jnp.where(s.hit[:, None], stack(normal), 0.0).reshape(*shape, 3)
-        return jnp.abs(normals - normals[:1]).sum(axis=-1, keepdims=True).max(axis=0)
-
-    return {
-        "depth_min": depth.min(axis=0), "depth_max": depth.max(axis=0),
-        "color_min": color.min(axis=0), "color_max": color.max(axis=0),
-        "normal_spread": spread(s.normal), "normal_spread_smooth": spread(s.smooth_normal),
-    }  # fmt: skip
+    hit = s.hit[:, None]
+    normals = [jnp.where(hit, stack(normal), 0.0) for normal in (s.normal, s.smooth_normal)]
+    return normals[0], normals[1], jnp.where(hit, (t * cosine)[:, None], jnp.inf)
 
 
 def screen_grid(width: int, height: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,30 +153,52 @@ def chunk_size() -> int:
     return CPU_CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
 
 
+def _workers() -> int:
+    return min(os.cpu_count() or 1, 16) if jax.default_backend() == "cpu" else 1
+
+
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    workers = min(os.cpu_count() or 1, 8) if jax.default_backend() == "cpu" else 1
-    return ThreadPoolExecutor(workers, thread_name_prefix="essjax-render")
+    return ThreadPoolExecutor(_workers(), thread_name_prefix="essjax-render")
 
 
-def in_chunks(function: Callable, x: np.ndarray, y: np.ndarray, rays_per_pixel: int = 1) -> dict[str, np.ndarray]:
-    """Call ``function(x, y)`` on equal pieces, in parallel on a CPU, and join the arrays it returns.
+def tile_order(width: int, height: int, tile: int) -> np.ndarray:
+    """Indices of all pixels, tile by tile: rays that are traced together should lie together."""
+    y, x = np.divmod(np.arange(width * height), width)
+    return np.lexsort((x, y, x // tile, y // tile))
+
+
+def in_tiles(
+    function: Callable, x: np.ndarray, y: np.ndarray, width: int, height: int, *, rays: int, samples: int = 1
+) -> dict[str, np.ndarray]:
+    """Call ``function(x, y)`` on compact groups of pixels, in parallel on a CPU: images ``[H, W, C]`` by name.
 
     XLA:CPU runs the small loops of the ray caster on one core; a Python thread per core (the call releases the GIL)
     keeps all of them busy.
+
+    Args:
+      function: of screen positions ``[rays // samples]``; returns arrays with that leading axis.
+      x: flat screen positions, right.
+      y: flat screen positions, down.
+      width: of the image, pixels.
+      height: of the image, pixels.
+      rays: per call; always the same, so that there is one compilation.
+      samples: per pixel.
     """
-    total = x.shape[0]
-    pieces = max(1, -(-total * rays_per_pixel // chunk_size()))
-    if jax.default_backend() == "cpu":  # an even share for every core
-        cores = min(os.cpu_count() or 1, 8)
-        pieces = -(-pieces // cores) * cores
-    size = -(-total // pieces)
-    padded = [np.pad(v, (0, pieces * size - total)).reshape(pieces, size) for v in (x, y)]
-    jobs = [
-        _threads().submit(lambda a, b: jax.device_get(function(a, b)), *piece) for piece in zip(*padded, strict=True)
-    ]
-    results = [job.result() for job in jobs]
-    return {name: np.concatenate([result[name] for result in results])[:total] for name in results[0]}
+    size = max(1, rays // samples)
+    order = tile_order(width, height, max(1, int(size**0.5)))
+    pieces = -(-order.size // size)
+    padded = np.pad(order, (0, pieces * size - order.size), mode="edge").reshape(pieces, size)
+    run = lambda part: jax.device_get(function(x[part], y[part]))
+    results = [run(padded[0])]  # alone: threads that meet an uncompiled function would each compile it
+    results += _threads().map(run, padded[1:])
+    images = {}
+    for name in results[0]:
+        flat = np.concatenate([result[name] for result in results])[: order.size]
+        image = np.empty_like(flat)
+        image[order] = flat
+        images[name] = image.reshape(height, width, -1)
+    return images
 
 
 def pixel_angle(world: World, width: int, mip_bias: float = 0.0) -> np.float32:
@@ -189,29 +206,40 @@ def pixel_angle(world: World, width: int, mip_bias: float = 0.0) -> np.float32:
     return np.float32(2.0**mip_bias / (float(world.focal) * width))
 
 
-def _as_image(flat: np.ndarray, width: int, height: int) -> np.ndarray:
-    return flat.reshape(height, width, -1)
+def _spread(x: np.ndarray, y: np.ndarray, offsets: np.ndarray, rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """All samples of all pixels, samples first, padded to ``rays``."""
+    pad = (0, rays - x.size * len(offsets))
+    return tuple(np.pad((v[None] + offsets[:, k, None]).ravel(), pad, mode="edge") for k, v in enumerate((x, y)))  # type: ignore[return-value]
 
 
 def render_reference(world: World, width: int, height: int, *, spp: int = 64) -> np.ndarray:
     """Anti-aliased image ``[H, W, 3]``: ``spp`` samples per pixel, box filter."""
     world = jax.device_put(world)
     offsets = (reference_samples(spp) - 0.5) / width
-    angle = pixel_angle(world, width)
+    angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
+
+    def average(x, y):
+        color = color_along(world, *_spread(x, y, offsets, rays), angle)
+        return {"color": color[: x.size * spp].reshape(spp, x.size, 3).mean(axis=0)}
+
     x, y = screen_grid(width, height, np.zeros(2))
-    function = lambda a, b: {"color": average_color(world, a, b, offsets[:, 0], offsets[:, 1], angle)}
-    return _as_image(in_chunks(function, x, y, spp)["color"], width, height)
+    return in_tiles(average, x, y, width, height, rays=rays, samples=spp)["color"]
 
 
 def render_buffers(
     world: World, previous: World, width: int, height: int, jitter: np.ndarray, angle: np.float32
 ) -> dict[str, np.ndarray]:
-    """``buffers`` as images ``[H, W, C]``; motion in pixels; ``steady`` eroded by a pixel, ``stencil`` int32."""
+    """``buffers`` and one-sample ``color`` as images ``[H, W, C]``; motion in pixels, ``stencil`` int32.
+
+    ``steady`` is eroded by a pixel: a shadow's edge that passes near a sample also touches its pixel.
+    """
     world, previous = jax.device_put((world, previous))
     x, y = screen_grid(width, height, jitter)
     half_height = np.float32(0.5 * height / width)
-    images = in_chunks(lambda a, b: buffers(world, previous, a, b, half_height, angle), x, y)
-    images = {name: _as_image(flat, width, height) for name, flat in images.items()}
+    images = in_tiles(
+        lambda a, b: buffers(world, previous, a, b, half_height, angle), x, y, width, height, rays=chunk_size() // 4
+    )
+    images |= in_tiles(lambda a, b: {"color": color_along(world, a, b, angle)}, x, y, width, height, rays=chunk_size())
     images["motion"] = images["motion"] * np.float32(width)
     images["stencil"] = np.rint(images["stencil"]).astype(np.int32)
     images["steady"] = _erode(images["steady"])
@@ -219,17 +247,28 @@ def render_buffers(
 
 
 def _erode(mask: np.ndarray) -> np.ndarray:
-    """Smallest value of the 3x3 neighbourhood: a shadow's edge that passes near a sample also touches its pixel."""
+    """Smallest value of the 3x3 neighbourhood."""
     padded = np.pad(mask, ((1, 1), (1, 1), (0, 0)), mode="edge")
     height, width = mask.shape[:2]
     return np.min([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
 
 
 def render_statistics(world: World, width: int, height: int, *, spp: int = 64) -> dict[str, np.ndarray]:
-    """``sample_statistics`` as images ``[H, W, C]``."""
+    """What ``sequence.subsample_statistics`` returns, images ``[H, W, C]``."""
     world = jax.device_put(world)
     offsets = (reference_samples(spp) - 0.5) / width
-    angle = pixel_angle(world, width)
+    angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
+
+    def ranges(x, y):
+        places = _spread(x, y, offsets, rays)
+        results = (color_along(world, *places, angle), *normals_and_depth(world, *places, angle))
+        color, normal, smooth, depth = (np.asarray(r)[: x.size * spp].reshape(spp, x.size, -1) for r in results)
+        distance = lambda n: np.abs(n - n[:1]).sum(axis=-1, keepdims=True).max(axis=0)
+        return {
+            "depth_min": depth.min(axis=0), "depth_max": depth.max(axis=0),
+            "color_min": color.min(axis=0), "color_max": color.max(axis=0),
+            "normal_spread": distance(normal), "normal_spread_smooth": distance(smooth),
+        }  # fmt: skip
+
     x, y = screen_grid(width, height, np.zeros(2))
-    images = in_chunks(lambda a, b: sample_statistics(world, a, b, offsets[:, 0], offsets[:, 1], angle), x, y, spp)
-    return {name: _as_image(flat, width, height) for name, flat in images.items()}
+    return in_tiles(ranges, x, y, width, height, rays=rays, samples=spp)

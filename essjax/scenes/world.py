@@ -7,6 +7,7 @@ first ``counts[kind]`` are used: counts are data, so one compilation renders eve
 
 import chex
 import jax.numpy as jnp
+import numpy as np
 
 from essjax.typing import Array, Float, Int
 
@@ -16,6 +17,10 @@ CAPACITY = (16, 48, 24, 64)
 OFFSET = (0, 16, 64, 88)
 """First row of each kind."""
 ROWS = 152
+ROW_KIND = np.repeat(np.arange(4), CAPACITY)
+"""Kind of each row."""
+ROW_MEMBER = np.concatenate([np.arange(count) for count in CAPACITY])
+"""Number of each row within its kind."""
 LIGHTS = 2
 """Most lights that cast shadows."""
 
