@@ -143,7 +143,10 @@ def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
         (["import", tmp_path / "nothing", out], "meta.json: not found."),
         (["import", dump, out, "--preset", "unreal"], "error: --preset: expected one of blender, got 'unreal'."),
         (["import", dump, out, "--train", "9-12"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
-        (["import", dump, out, "--train", "8:20"], "expected first <= score_from <= last within the frames 8..13"),
+        (
+            ["import", dump, out, "--train", "8:20"],
+            "error: train: expected first <= last within the frames 8..13, got 8..20.",
+        ),
     ):
         code, output = run(capsys, *arguments)
         assert code == 2 and message in output and "Traceback" not in output

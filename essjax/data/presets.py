@@ -102,6 +102,24 @@ def _read_meta(folder: Path) -> _Dump:
     return _Dump(folder, width, height, wide // width, cameras, jitters)
 
 
+def _check_files(dump: _Dump) -> None:
+    paths = [dump.folder / f"{kind}.{number:04d}.exr" for number in dump.numbers for kind in ("lr", "hr")]
+    missing = [path.name for path in paths if not path.is_file()]
+    if missing:
+        raise ValueError(
+            f"{dump.folder}: {len(missing)} of the {len(paths)} images that meta.json lists are missing, the first is "
+            f"{missing[0]}. Render or copy them, or take their frames out of meta.json."
+        )
+
+
+def _check_ranges(ranges: Mapping[str, tuple[int, int]], numbers: list[int]) -> None:
+    for split, (first, last) in ranges.items():
+        if not numbers[0] <= first <= last <= numbers[-1]:
+            raise ValueError(
+                f"{split}: expected first <= last within the frames {numbers[0]}..{numbers[-1]}, got {first}..{last}."
+            )
+
+
 class _Passes:
     """Channels of one Blender file, looked up by pass name whatever the view layer is called."""
 
@@ -312,6 +330,9 @@ def import_blender(
     dump = _read_meta(folder)
     name = name or folder.resolve().name
     numbers = dump.numbers
+    _check_files(dump)
+    ranges = dict(splits) if splits else default_splits(numbers[0], numbers[-1])
+    _check_ranges(ranges, numbers)
     dynamic = _dynamic_ids(dump)
     writer = SequenceWriter(
         out, name, source={"preset": "blender", "frames": [numbers[0], numbers[-1]], "dynamic": list(dynamic)}
@@ -322,7 +343,6 @@ def import_blender(
             writer.write(number, frame, reference, notes=counts)
         on_frame(done + 1, len(numbers))
     info = writer.finish()
-    ranges = dict(splits) if splits else default_splits(numbers[0], numbers[-1])
     segments = clip_segments(name, numbers[0], ranges)
     dataset = write_dataset(out, segments, source={"preset": "blender"})
     totals: dict[str, int] = {}

@@ -243,7 +243,9 @@ def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
     with pytest.raises(ValueError, match="preset: expected one of blender, got 'unreal'"):
         import_dataset(dump, tmp_path / "out", "unreal")
     (dump / "hr.0010.exr").rename(dump / "gone.exr")
-    with pytest.raises(ValueError, match=r"hr\.0010\.exr: expected an EXR file, found nothing"):
+    with pytest.raises(
+        ValueError, match=r"1 of the 12 images that meta\.json lists are missing, the first is hr\.0010"
+    ):
         run()
     (dump / "gone.exr").rename(dump / "hr.0010.exr")
     write_parts(dump / "lr.0010.exr", {k: v for k, v in raw_frame(10).items() if not k.startswith("basecolor")})
@@ -254,6 +256,8 @@ def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
     write_parts(dump / "lr.0010.exr", {k: v[1:] for k, v in raw_frame(10).items()})
     with pytest.raises(ValueError, match=r"lr\.0010\.exr, channel .*: expected 20x12 as meta\.json says, got 20x11"):
         run()
+    with pytest.raises(ValueError, match=r"test: expected first <= last within the frames 8\.\.13, got 12\.\.14"):
+        import_dataset(dump, tmp_path / "out", "blender", splits={"train": (8, 11), "test": (12, 14)})
     meta = json.loads((dump / "meta.json").read_text())
     (dump / "meta.json").write_text(json.dumps({**meta, "display_size": [50, 24]}))
     with pytest.raises(ValueError, match=r"whole multiple of render_size, got 50x24 and 20x12"):
