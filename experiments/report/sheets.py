@@ -39,7 +39,7 @@ def write_sheet(path: Path, picture: Picture) -> None:
     _write(sheet, (GAP, 12), title, INK, 20)
     for k, cell in enumerate(cells):
         sheet.paste(cell, (GAP + k % columns * (CELL + GAP), TITLE + k // columns * (height + GAP)))
-    sheet.save(path, optimize=True)
+    sheet.save(path, compress_level=4)  # optimize=True takes 10x the time for 2 % fewer bytes
 
 
 def _cell(picture: Picture, name: str) -> Image.Image:
