@@ -1,0 +1,357 @@
+"""ExtraSS (Wu et al. 2023): ``extrass_w``, ``extrass_e`` (low resolution, extrapolation) and ``extrass`` (both kinds, 2x).
+
+Pipeline: G-buffer guided warp (section 4.2), FRNet on the downsampled warp (4.3), ExtraSSNet (4.4).
+"""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from essjax.color import expm1, log1p
+from essjax.frames import Frame, GBuffers, Prediction, depth_scale, network_depth, select_time
+from essjax.interfaces import Method, MethodInfo, Network, no_variables, reset_at_cut
+from essjax.methods.rendered import RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
+from essjax.networks import extrassnet, frnet
+from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
+from essjax.typing import Array, Color, Image, Jitter, Mask, PyTree
+from essjax.warp import (
+    backward_warp,
+    hole_mask,
+    inside_mask,
+    jitter_aligned_upsample,
+    sample_distance,
+    space_to_depth,
+    depth_to_space,
+    upsample_motion,
+)
+
+SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
+"""Standard deviations of base colour and normal in eq 2; not in the paper, chosen on validation data."""
+SIGMA_DISTANCE = 4.0
+"""Standard deviation of the screen distance in eq 2, LR pixels."""
+REFINE_DELTA = 0.1
+"""delta_1 = delta_2 of eq 6."""
+
+
+def extrass_w(
+    *, sigma_guide: float | tuple[float, ...] = SIGMA_GUIDE, sigma_distance: float = SIGMA_DISTANCE
+) -> Method:
+    """G-buffer guided warping only ("Ours-W" in Table 2): extrapolates at low resolution, nothing to train.
+
+    Args:
+      sigma_guide: of the guides in eq 2, one number or one per channel (base colour, normal).
+      sigma_distance: of the screen distance in eq 2, LR pixels.
+    """
+
+    def render_step(variables, history, frame, *, train=False):
+        return _store(history, frame), Prediction(image=frame.color)
+
+    def extrapolate_step(variables, history, frame, *, train=False):
+        history = advance(reset_pair(frame.cut, start_pair(frame), history), frame)
+        newest = select_time(history.frames, 0)
+        image = guided_extrapolation(newest, frame, sigma_guide=sigma_guide, sigma_distance=sigma_distance)
+        return history, Prediction(image=image, aux={"warp": image})
+
+    info = MethodInfo("extrass-w", scale=1, predicts=frozenset({"ess"}))
+    return Method(no_variables, start_pair, render_step, extrapolate_step, info)
+
+
+def _store(history: RenderedPair, frame: Frame) -> RenderedPair:
+    return push(advance(reset_pair(frame.cut, start_pair(frame), history), frame), frame)
+
+
+def halve(image: Image) -> Image:
+    """The downsampling ⁻ of section 4.3: 2x2 box; odd sizes repeat their last row or column."""
+    return mean_pool(pad_to_multiple(image, 2))
+
+
+def _enlarge(image: Image, like: Image) -> Image:
+    return crop(nearest_upsample(image), *like.shape[-3:-1])
+
+
+def refine(network: Network, variables: PyTree, warped: Color, gbuffers: GBuffers) -> dict:
+    """Shading refinement (eq 4-6): returns ``image`` (the blend of eq 5), FRNet's half-size output and the mask.
+
+    Args:
+      network: FRNet.
+      variables: its variables.
+      warped: f_g(i_{t-1}) and f_g(i_{t-3}), linear, ``[2, ..., H, W, 3]``.
+      gbuffers: the current ones; roughness counts as 1 where absent.
+    """
+    roughness = jnp.ones_like(gbuffers.depth) if gbuffers.roughness is None else gbuffers.roughness
+    small = log1p(halve(warped))
+    output, _ = network.apply(variables, small, halve(roughness))
+    refined, warped = backward_warp(small[0], output["flow"]), warped[0]
+    mask = jax.lax.stop_gradient(blend_mask(expm1(refined), warped, gbuffers))
+    image = jnp.where(mask > 0, _enlarge(expm1(refined), warped), warped)
+    return {"image": image, "half": refined, "flow": output["flow"], "features": output["features"], "mask": mask}
+
+
+def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: float = REFINE_DELTA) -> Mask:
+    """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear)."""
+    base, normal = gbuffers.base_color, gbuffers.normal
+    base_half, normal_half = _enlarge(halve(base), base), _enlarge(halve(normal), normal)
+    distance = jnp.linalg.norm(base_half - base, axis=-1, keepdims=True) / jnp.sqrt(3.0)
+    similar = (1.0 - distance) * jnp.sum(normal_half * normal, axis=-1, keepdims=True) > delta
+    large = _enlarge(refined, warped)
+    norm = jnp.maximum(jnp.linalg.norm(large, axis=-1, keepdims=True), 1e-3)
+    # FRNet may only act where it changed something: its input, downsampled and enlarged, is what it started from.
+    before = _enlarge(halve(warped), warped)
+    changed = jnp.linalg.norm(large - before, axis=-1, keepdims=True) / norm > delta
+    return (similar & changed).astype(warped.dtype)
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Extrapolated:
+    """What the low-resolution part of an ESS frame yields; all linear unless said otherwise.
+
+    Attributes:
+      warp: f_g(i_{t-1}), ``[..., H, W, 3]``.
+      image: ī of eq 5, ``[..., H, W, 3]``.
+      half: FRNet's output, log1p, ``[..., H/2, W/2, 3]``.
+      flow: ``[..., H/2, W/2, 2]`` half-size pixels.
+      features: three levels of FRNet's features of the predicted frame.
+      mask: m̂, ``[..., H, W, 1]``.
+    """
+
+    warp: Color
+    image: Color
+    half: Color
+    flow: Array
+    features: list[Image]
+    mask: Mask
+
+
+def _extrapolate(network: Network, variables: PyTree, pair: RenderedPair, frame: Frame, sigmas: dict) -> Extrapolated:
+    # Rendered frames carry no parameters: without stop_gradient the warps' backward pass would be computed for nothing.
+    warped = jax.lax.stop_gradient(guided_extrapolation(pair.frames, frame, **sigmas))
+    refined = refine(network, variables, warped, frame.gbuffers)
+    return Extrapolated(warp=warped[0], **refined)
+
+
+def _frnet_inputs(example: Frame) -> tuple[Image, Image]:
+    half = halve(jnp.zeros_like(example.gbuffers.base_color))
+    return jnp.stack([half, half]), half[..., :1]
+
+
+def extrass_e(
+    *,
+    width: int = 16,
+    sigma_guide: float | tuple[float, ...] = SIGMA_GUIDE,
+    sigma_distance: float = SIGMA_DISTANCE,
+) -> Method:
+    """Guided warping and shading refinement ("Ours-E" in Table 2): extrapolates at low resolution.
+
+    ``variables = {"frnet": ...}``. The extrapolated step's ``aux["extrapolated"]`` is an ``Extrapolated``.
+
+    Args:
+      width: of FRNet.
+      sigma_guide: see ``extrass_w``.
+      sigma_distance: see ``extrass_w``.
+    """
+    network = frnet(width)
+    sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
+
+    def init(key, example):
+        return {"frnet": network.init(key, *_frnet_inputs(example))}
+
+    def render_step(variables, history, frame, *, train=False):
+        return _store(history, frame), Prediction(image=frame.color)
+
+    def extrapolate_step(variables, history, frame, *, train=False):
+        history = advance(reset_pair(frame.cut, start_pair(frame), history), frame)
+        result = _extrapolate(network, variables["frnet"], history, frame, sigmas)
+        return history, Prediction(image=result.image, aux={"extrapolated": result})
+
+    info = MethodInfo("extrass-e", scale=1, predicts=frozenset({"ess"}))
+    return Method(init, start_pair, render_step, extrapolate_step, info)
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class History:
+    """The recurrent state of ``extrass``.
+
+    Attributes:
+      rendered: the two latest rendered LR frames.
+      image: last HR output, linear, ``[..., sH, sW, 3]``.
+      gbuffers: of the last frame, rendered or not.
+      jitter: of the last frame.
+      depth_scale: unit of depth, ``[...]``.
+      empty: bool ``[...]``: no output yet since the cut.
+    """
+
+    rendered: RenderedPair
+    image: Color
+    gbuffers: GBuffers
+    jitter: Jitter
+    depth_scale: Array
+    empty: Array
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Warped:
+    """f_r: the HR history warped to the current frame.
+
+    Attributes:
+      log_image: log1p, ``[..., sH, sW, 3]``.
+      valid: ``[..., sH, sW, 1]``: 1 where the previous position is on screen and showed the same surface.
+      valid_low: the same at LR.
+    """
+
+    log_image: Color
+    valid: Mask
+    valid_low: Mask
+
+
+def warp_history(history: History, frame: Frame, scale: int) -> Warped:
+    """Plain backward warp of the HR output and where it may be trusted (f_r of eq 10)."""
+    motion = upsample_motion(frame.motion, scale, jitter=frame.jitter)
+    valid_low = hole_mask(
+        frame.gbuffers, history.gbuffers, frame.motion, jitter=frame.jitter, jitter_previous=history.jitter
+    )
+    valid_low = jnp.where(history.empty[..., None, None, None], 0.0, valid_low)
+    if frame.reactive is not None:
+        valid_low = valid_low * (1.0 - frame.reactive)
+    valid = nearest_upsample(valid_low, scale) * inside_mask(motion)
+    # Bicubic: bilinear would blur the history a little more with every frame. Its overshoot below 0 is cut by log1p.
+    image = log1p(backward_warp(history.image, motion, mode="bicubic"))
+    return Warped(log_image=image, valid=jax.lax.stop_gradient(valid), valid_low=jax.lax.stop_gradient(valid_low))
+
+
+def _prior(valid: Mask, weight: Array | float) -> Array:
+    """Logit of the current sample's share before training: ``weight`` on trusted history, nearly all elsewhere."""
+    share = jnp.where(valid > 0, weight, 0.98)
+    return jnp.log(share) - jnp.log1p(-share)
+
+
+SAMPLE_SHARE = 0.3
+"""Share of a rendered sample that lies on the centre of an HR pixel; less with distance (Gaussian, below)."""
+SAMPLE_SIGMA = 0.6
+"""Its standard deviation, HR pixels."""
+EXTRAPOLATED_SHARE = 0.1
+"""Share of the LR extrapolation on ESS frames, where history is trusted."""
+
+
+def _sample_weight(frame: Frame, height: int, width: int, scale: int) -> Array:
+    distance = sample_distance(height, width, scale, frame.jitter)
+    squared = jnp.sum(distance**2, axis=-1, keepdims=True)
+    return SAMPLE_SHARE * jnp.exp(-0.5 * squared / SAMPLE_SIGMA**2) + 0.02
+
+
+def _compose(head: Array, warped: Warped, current: Image, weight: Array | float, scale: int) -> Image:
+    """Blend history and ``current`` (both log1p, HR) by the corrected prior and add the residual."""
+    output = depth_to_space(head, scale)
+    share = jax.nn.sigmoid(_prior(warped.valid, weight) + output[..., :1])
+    return warped.log_image + share * (current - warped.log_image) + output[..., 1:]
+
+
+def extrass(
+    *,
+    width: int = 24,
+    frnet_width: int = 16,
+    scale: int = 2,
+    sigma_guide: float | tuple[float, ...] = SIGMA_GUIDE,
+    sigma_distance: float = SIGMA_DISTANCE,
+) -> Method:
+    """ExtraSS: supersamples rendered frames (SS) and extrapolated ones (ESS).
+
+    ``variables = {"frnet": ..., "extrassnet": ...}``. ``aux`` of both steps: ``log_image`` (output, log1p), ``warped``
+    (a ``Warped``), ``features`` (4 levels); the ESS step adds ``extrapolated`` (an ``Extrapolated``).
+
+    Args:
+      width: of ExtraSSNet.
+      frnet_width: of FRNet.
+      scale: output size over input size.
+      sigma_guide: see ``extrass_w``.
+      sigma_distance: see ``extrass_w``.
+    """
+    flow_network, network = frnet(frnet_width), extrassnet(width, scale)
+    sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
+
+    def start(example: Frame) -> History:
+        image = nearest_upsample(jnp.zeros_like(example.gbuffers.base_color), scale)
+        return History(
+            rendered=start_pair(example),
+            image=image,
+            gbuffers=example.gbuffers,
+            jitter=example.jitter,
+            depth_scale=depth_scale(example.gbuffers),
+            empty=jnp.ones(example.cut.shape, bool),
+        )
+
+    def reset(frame: Frame, history: History) -> History:
+        fresh = start(frame)
+        rendered = reset_pair(frame.cut, fresh.rendered, history.rendered)
+        rest = reset_at_cut(
+            frame.cut, dataclasses.replace(fresh, rendered=None), dataclasses.replace(history, rendered=None)
+        )
+        return dataclasses.replace(rest, rendered=rendered)
+
+    def init(key, example):
+        key_flow, key_net = jax.random.split(key)
+        history = start(example)
+        warped = warp_history(history, example, scale)
+        color = jnp.zeros_like(example.gbuffers.base_color)
+        inputs = [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
+        return {
+            "frnet": flow_network.init(key_flow, *_frnet_inputs(example)),
+            "extrassnet": network.init(key_net, *inputs),
+        }
+
+    def _extras(frame: Frame, warp: Color) -> tuple[list[Image], list[Image]]:
+        return [], [log1p(warp), frame.gbuffers.base_color]
+
+    def _inputs(frame: Frame, history: History, warped: Warped, color: Color, extra: list[Image]):
+        """Inputs of E0 or E1 at LR, and the LR colour aligned to HR (log1p)."""
+        aligned = jitter_aligned_upsample(log1p(color), scale, frame.jitter)
+        shape = frame.gbuffers.depth.shape[:-1]
+        low = [
+            log1p(color),
+            network_depth(frame.gbuffers, history.depth_scale),
+            warped.valid_low,
+            jnp.broadcast_to(frame.jitter[..., None, None, :], (*shape, 2)),
+            *extra,
+        ]
+        high = [space_to_depth(aligned, scale), space_to_depth(warped.log_image, scale)]
+        return jnp.concatenate([*high, *low], axis=-1), aligned
+
+    def _finish(history: History, frame: Frame, rendered: RenderedPair, log_image: Image) -> tuple[History, Color]:
+        image = expm1(log_image)
+        history = dataclasses.replace(
+            history,
+            rendered=rendered,
+            image=image,
+            gbuffers=frame.gbuffers,
+            jitter=frame.jitter,
+            empty=jnp.zeros_like(history.empty),
+        )
+        return history, image
+
+    def render_step(variables, history, frame, *, train=False):
+        history = reset(frame, history)
+        warped = warp_history(history, frame, scale)
+        inputs, aligned = _inputs(frame, history, warped, frame.color, _extras(frame, frame.color)[0])
+        (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
+        weight = _sample_weight(frame, *frame.motion.shape[-3:-1], scale)
+        log_image = _compose(head, warped, aligned, weight, scale)
+        rendered = push(advance(history.rendered, frame), frame)
+        history, image = _finish(history, frame, rendered, log_image)
+        aux = {"log_image": log_image, "warped": warped, "features": features}
+        return history, Prediction(image=image, aux=aux)
+
+    def extrapolate_step(variables, history, frame, *, train=False):
+        history = reset(frame, history)
+        warped = warp_history(history, frame, scale)
+        rendered = advance(history.rendered, frame)
+        low = _extrapolate(flow_network, variables["frnet"], rendered, frame, sigmas)
+        inputs, aligned = _inputs(frame, history, warped, low.image, _extras(frame, low.warp)[1])
+        (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="extrapolate")
+        log_image = _compose(head, warped, aligned, EXTRAPOLATED_SHARE, scale)
+        history, image = _finish(history, frame, rendered, log_image)
+        aux = {"log_image": log_image, "warped": warped, "features": features, "extrapolated": low}
+        return history, Prediction(image=image, aux=aux)
+
+    info = MethodInfo("extrass", scale=scale)
+    return Method(init, start, render_step, extrapolate_step, info)

@@ -1,0 +1,89 @@
+"""ExtraSSNet: one U-Net for supersampled and extrapolated frames (ExtraSS section 4.4, eq 10).
+
+Two encoders E0 (SS) and E1 (ESS), one decoder. All convolution runs at LR or below: HR inputs come in by
+space-to-depth, the output leaves by depth-to-space. The head predicts, per HR pixel, a correction to the blending logit
+of its two candidates and a residual, and starts at zero, so that the untrained network returns the prior blend.
+"""
+
+import flax.linen as nn
+import jax.numpy as jnp
+
+from essjax.interfaces import Network
+from essjax.networks.blocks import ConvBlock, crop, mean_pool, nearest_upsample, pad_to_multiple, zero_conv
+from essjax.networks.linen import from_linen
+from essjax.typing import Image
+
+LEVELS = 4
+
+
+class Encoder(nn.Module):
+    """Four levels at sizes 1, 1/2, 1/4, 1/8 of LR; returns their features, finest first."""
+
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x: Image) -> list[Image]:
+        """Encode ``[B, H, W, C]``; both sizes must be multiples of 8."""
+        features = []
+        for level, width in enumerate(self.widths):
+            x = ConvBlock(width)(mean_pool(x) if level else x)
+            features.append(x)
+        return features
+
+
+class Decoder(nn.Module):
+    """From coarse to fine, skips concatenated; returns the head's channels at LR."""
+
+    widths: tuple[int, ...]
+    channels: int
+
+    @nn.compact
+    def __call__(self, features: list[Image]) -> Image:
+        """Decode the encoder's levels to ``[B, H, W, channels]``."""
+        x = features[-1]
+        for level in reversed(range(len(self.widths) - 1)):
+            reduced = nn.Conv(self.widths[level], (1, 1))(x)  # before upsampling: a quarter of the work
+            joined = jnp.concatenate([nearest_upsample(reduced), features[level]], axis=-1)
+            x = ConvBlock(self.widths[level], layers=2 if level else 1)(joined)
+        return zero_conv(self.channels)(x)
+
+
+class ExtraSSNet(nn.Module):
+    """Both encoders and the decoder.
+
+    Attributes:
+      width: channels at LR; the levels have 1, 1.5, 2 and 3 times as many.
+      scale: HR size over LR size.
+    """
+
+    width: int = 24
+    scale: int = 2
+
+    def setup(self):
+        """Make E0, E1 and D."""
+        widths = (self.width, self.width * 3 // 2, self.width * 2, self.width * 3)
+        self.encoder_ss = Encoder(widths)
+        self.encoder_ess = Encoder(widths)
+        self.decoder = Decoder(widths, 4 * self.scale**2)
+
+    def _run(self, encoder: Encoder, inputs: Image) -> tuple[Image, list[Image]]:
+        height, width = inputs.shape[-3:-1]
+        features = encoder(pad_to_multiple(inputs, 2 ** (LEVELS - 1)))
+        return crop(self.decoder(features), height, width), features
+
+    def render(self, inputs: Image, train: bool = False) -> tuple[Image, list[Image]]:
+        """SS: ``(head [B, H, W, 4 scale^2], features of 4 levels)`` from E0's inputs."""
+        return self._run(self.encoder_ss, inputs)
+
+    def extrapolate(self, inputs: Image, train: bool = False) -> tuple[Image, list[Image]]:
+        """ESS: the same from E1's inputs."""
+        return self._run(self.encoder_ess, inputs)
+
+    def __call__(self, inputs_ss: Image, inputs_ess: Image, train: bool = False):
+        """Both paths: what ``init`` needs to make all parameters."""
+        return self.render(inputs_ss), self.extrapolate(inputs_ess)
+
+
+def extrassnet(width: int = 24, scale: int = 2) -> Network:
+    """ExtraSSNet as a ``Network``; choose the path with ``apply(..., method="render" | "extrapolate")``."""
+    return from_linen(ExtraSSNet(width, scale))

@@ -1,0 +1,140 @@
+"""The training loop: a budget in steps or seconds, checkpoints, exact resumption, a stop on signals and on NaN."""
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from essjax.train.checkpoint import Checkpoints
+from essjax.train.state import TrainState
+
+
+class Interrupted(RuntimeError):
+    """Training was asked to stop (SIGTERM, Ctrl-C); the state is saved."""
+
+
+class NonFiniteLoss(RuntimeError):
+    """A loss or gradient was NaN or infinite; the state before it and the batch are saved."""
+
+
+class Budget(NamedTuple):
+    """When a stage ends: after ``steps``, or after ``seconds`` of training in all runs together; None = no limit."""
+
+    steps: int | None
+    seconds: float | None
+
+    def progress(self, step: int, seconds: float) -> float:
+        """Fraction that is used up, in [0, 1]. With a limit in steps alone it does not depend on the machine."""
+        used = [step / self.steps] if self.steps else []
+        used += [seconds / self.seconds] if self.seconds else []
+        if not used:
+            raise ValueError("budget: expected a limit in steps or in seconds, got neither.")
+        return min(max(used), 1.0)
+
+
+def train(
+    step_function: Callable,
+    state: TrainState,
+    batches: Iterator,
+    checkpoints: Checkpoints,
+    log_path: Path,
+    budget: Budget,
+    schedule: Callable[[float], float],
+    *,
+    save_every: float = 30.0,
+    on_step: Callable[[int, float, dict[str, float]], None] = lambda step, progress, terms: None,
+) -> tuple[TrainState, dict[str, Any]]:
+    """Run a stage to the end of its budget, from its newest checkpoint if there is one.
+
+    Args:
+      step_function: from ``make_train_step``.
+      state: the state at step 0; the checkpoint's replaces it.
+      batches: a grain iterator: ``next``, ``get_state``, ``set_state``.
+      checkpoints: where the state is kept.
+      log_path: JSON lines, one per step; cut back to the checkpoint's step when a run resumes.
+      budget: when to end.
+      schedule: learning rate of progress in [0, 1].
+      save_every: seconds between checkpoints.
+      on_step: called with step, progress and the terms of that step.
+
+    Returns:
+      The final state and ``{"steps", "seconds", "terms"}``.
+
+    Raises:
+      Interrupted: a signal came; everything is saved.
+      NonFiniteLoss: names the terms; the batch is in ``log_path``'s folder.
+    """
+    seconds = 0.0
+    if checkpoints.latest() is not None:
+        state, saved = checkpoints.restore(state)
+        seconds = saved["seconds"]
+        batches.set_state(saved["batches"])  # type: ignore[attr-defined]
+    step, terms = int(state.step), {}
+    _truncate(log_path, step)
+    started = last_save = time.monotonic() - seconds
+    with _SignalFlag() as stop, log_path.open("a") as log:
+
+        def save():
+            progress = {"seconds": seconds, "batches": batches.get_state()}  # type: ignore[attr-defined]
+            log.flush()
+            checkpoints.save(step, state, progress)
+
+        while budget.progress(step, seconds) < 1.0 and not stop.set:
+            batch = next(batches)
+            state, terms = step_function(state, batch, schedule(budget.progress(step, seconds)))
+            terms = {name: float(value) for name, value in jax.device_get(terms).items()}
+            step, seconds = step + 1, time.monotonic() - started
+            if not all(np.isfinite(value) for value in terms.values()):
+                _raise_non_finite(step, terms, batch, log_path.parent)
+            log.write(json.dumps({"step": step, "seconds": round(seconds, 2), **terms}) + "\n")
+            on_step(step, budget.progress(step, seconds), terms)
+            if time.monotonic() - last_save > save_every:
+                save()
+                last_save = time.monotonic()
+        save()
+        if stop.set and budget.progress(step, seconds) < 1.0:
+            raise Interrupted(f"stopped at step {step}; the state is saved. Run the same command with --resume.")
+    return state, {"steps": step, "seconds": seconds, "terms": terms}
+
+
+def _raise_non_finite(step: int, terms: dict[str, float], batch: Any, folder: Path) -> None:
+    names = [name for name, value in terms.items() if not np.isfinite(value) and name != "loss"]
+    path = folder / f"non_finite_batch_{step}.npz"
+    leaves, _ = jax.tree_util.tree_flatten_with_path(batch)
+    np.savez_compressed(path, **{jax.tree_util.keystr(key).strip("."): np.asarray(leaf) for key, leaf in leaves})
+    raise NonFiniteLoss(
+        f"step {step}: not finite: {', '.join(names)}. The batch is in {path}; the last checkpoint is from before it. "
+        "Check the data (NaN, negative or huge radiance) or lower the learning rate."
+    )
+
+
+def _truncate(path: Path, step: int) -> None:
+    """Drop log lines that came after the checkpoint: the resumed run writes them again."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        lines = path.read_text().splitlines()[:step]
+        path.write_text("".join(line + "\n" for line in lines))
+
+
+class _SignalFlag:
+    """Turns SIGTERM and SIGINT into a flag while it is entered, so that a step is never torn."""
+
+    def __enter__(self):
+        self.set = False
+        try:
+            self._previous = {s: signal.signal(s, self._raise_flag) for s in (signal.SIGTERM, signal.SIGINT)}
+        except ValueError:  # not the main thread: signals stay as they are
+            self._previous = {}
+        return self
+
+    def _raise_flag(self, signum, stack):
+        self.set = True
+
+    def __exit__(self, *error):
+        for signum, handler in self._previous.items():
+            signal.signal(signum, handler)

@@ -1,0 +1,124 @@
+"""Settings of a run: presets, and ``--set key=value`` on top of them, checked."""
+
+import dataclasses
+import json
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Every setting of a run. Lengths in frames, sizes in LR pixels, times in seconds; None = no limit or absent.
+
+    Data that the renderer makes (ignored with ``--data``, but for ``clip`` and ``crop``):
+      seed, size (width, height), scale, train_sequences / validation_sequences / test_sequences (per family),
+      train_frames (also of validation), test_frames, train_spp (also of validation), test_spp, mip_bias.
+    Training: clip (frames per BPTT window), crop (width, height), frnet_batch, batch, width, frnet_width,
+      frnet_learning_rate, learning_rate, the stages' budgets *_steps and *_seconds, save_every,
+      the losses' weights of ExtraSS eq 9, 12, 14, vgg (path of VGG-16 weights).
+    Evaluation: warmup (frames not scored at the start and after a cut), pictures (chosen frames per sequence).
+    """
+
+    seed: int = 0
+    size: tuple[int, int] = (96, 54)
+    scale: int = 2
+    train_sequences: int = 3
+    validation_sequences: int = 1
+    test_sequences: int = 1
+    train_frames: int = 10
+    test_frames: int = 12
+    train_spp: int = 16
+    test_spp: int = 64
+    mip_bias: float = 0.0
+    clip: int = 6
+    crop: tuple[int, int] = (48, 48)
+    frnet_batch: int = 4
+    batch: int = 4
+    width: int = 16
+    frnet_width: int = 16
+    frnet_learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
+    frnet_steps: int | None = None
+    frnet_seconds: float | None = 60.0
+    steps: int | None = None
+    seconds: float | None = 230.0
+    save_every: float = 30.0
+    feature_weight: float = 0.001
+    occlusion_weight: float = 1.0
+    vgg_weight: float = 0.01
+    temporal_weight: float = 1.0
+    vgg: str | None = None
+    warmup: int = 5
+    pictures: int = 1
+
+
+PRESETS: dict[str, Config] = {
+    "smoke": Config(
+        size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=4, crop=(32, 24),
+        batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None,
+    ),
+    "quick": Config(),
+    "paper": Config(
+        size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
+        train_spp=64, clip=8, crop=(128, 128), batch=12, frnet_batch=8, width=24, frnet_width=24,
+        frnet_learning_rate=1e-4, learning_rate=4e-4, frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None,
+        seconds=None, save_every=300.0, pictures=2,
+    ),
+}  # fmt: skip
+"""smoke: every part runs, <= 60 s. quick: the default, <= 10 minutes on two cores. paper: the papers' settings
+(an epoch is counted as one crop from each of 120 sequences' 60 frames: 900 batches of 8, 600 of 12)."""
+
+PRESET_NAMES = tuple(PRESETS)
+
+
+def make_config(preset: str, overrides: list[str]) -> Config:
+    """The preset with ``key=value`` overrides; values are JSON (``size=[128,72]``, ``steps=null``) or plain words.
+
+    Raises:
+      ValueError: unknown preset or key (the valid ones are listed), or a value of the wrong type.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}.")
+    config = PRESETS[preset]
+    valid = {field.name: field for field in dataclasses.fields(Config)}
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator:
+            raise ValueError(f"--set {override}: expected key=value.")
+        if key not in valid:
+            raise ValueError(f"--set: unknown key {key!r}; valid keys are {', '.join(valid)}.")
+        config = dataclasses.replace(config, **{key: _parse(key, text, valid[key].type)})
+    _check(config)
+    return config
+
+
+def _parse(key: str, text: str, kind: Any) -> Any:
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        value = text
+    value = tuple(value) if isinstance(value, list) else value
+    optional = "None" in str(kind)
+    if value is None and optional:
+        return None
+    if kind is int or str(kind).startswith("int"):
+        fits = isinstance(value, int) and not isinstance(value, bool)
+    elif kind is float or str(kind).startswith("float"):
+        fits = isinstance(value, int | float) and not isinstance(value, bool)
+    elif "tuple" in str(kind):
+        fits = isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, int) and v > 0 for v in value)
+    else:
+        value, fits = text, True
+    if not fits:
+        expected = "[width,height]" if "tuple" in str(kind) else getattr(kind, "__name__", str(kind))
+        raise ValueError(f"--set {key}={text}: expected {expected}, got {text!r}.")
+    return value
+
+
+def _check(config: Config) -> None:
+    for name in ("frnet", ""):
+        steps, seconds = f"{name}_steps".lstrip("_"), f"{name}_seconds".lstrip("_")
+        if getattr(config, steps) is None and getattr(config, seconds) is None:
+            raise ValueError(f"--set: {steps} and {seconds} are both null; give one of them.")
+    for name in ("clip", "train_frames", "test_frames"):
+        if getattr(config, name) < 2:
+            raise ValueError(f"--set {name}: expected at least 2 frames, got {getattr(config, name)}.")
