@@ -1,6 +1,6 @@
 """Datasets on disk, import of renders, and the loader. Files: ``layout``; conventions: docs/conventions.md."""
 
-from essjax.data.augment import crop, flip
+from essjax.data.augment import crop, flip, start_with_cut
 from essjax.data.layout import Dataset, Segment, SequenceInfo, read_dataset, write_dataset
 from essjax.data.loader import CachedSource, Source, clips, disk_source
 from essjax.data.presets import PRESETS, ImportReport, import_dataset
@@ -9,5 +9,5 @@ from essjax.data.store import SequenceWriter, read_segment, read_sequence, write
 __all__ = [
     "PRESETS", "CachedSource", "Dataset", "ImportReport", "Segment", "SequenceInfo", "SequenceWriter", "Source",
     "clips", "crop", "disk_source", "flip", "import_dataset", "read_dataset", "read_segment", "read_sequence",
-    "write_dataset", "write_sequence",
+    "start_with_cut", "write_dataset", "write_sequence",
 ]  # fmt: skip

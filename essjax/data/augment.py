@@ -39,6 +39,26 @@ def _stays_inside(frame: Frame) -> np.ndarray:
     return np.asarray(inside.all(axis=-1, keepdims=True), np.float32)
 
 
+def start_with_cut(sequence: Sequence) -> Sequence:
+    """The sequence as if nothing had come before it: frame 0 is a cut, and all of it a hole unless it already was one.
+
+    Args:
+      sequence: NumPy leaves ``[T, ..., H, W, C]``; not changed.
+    """
+    cut = np.array(sequence.frames.cut)
+    was_cut, valid = cut[0].copy(), sequence.valid
+    cut[0] = True
+    if valid is not None:
+        valid = np.array(valid)
+        valid[0] *= was_cut[..., None, None, None]
+    native = sequence.native
+    if native is not None:
+        native = dataclasses.replace(native, cut=cut)
+    return dataclasses.replace(
+        sequence, frames=dataclasses.replace(sequence.frames, cut=cut), valid=valid, native=native
+    )
+
+
 def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:
     """Cut a window out of all frames, and the matching one out of the reference; native frames are dropped.
 

@@ -107,6 +107,15 @@ class Dataset:
             raise ValueError(f"{self.path}: no split {split!r}; this dataset has {', '.join(self.splits) or 'none'}.")
         return self.splits[split]
 
+    def numbers(self, segment: Segment) -> tuple[int, ...]:
+        """Original numbers of the frames that ``read_segment`` returns, in order."""
+        numbers = self.sequences[segment.sequence].numbers
+        return tuple(number for number in numbers if segment.first <= number <= segment.last)
+
+    def scored(self, segment: Segment) -> np.ndarray:
+        """Bool ``[T]`` over those frames: which are scored (warm-up after cuts is for the evaluation to leave out)."""
+        return np.asarray(self.numbers(segment)) >= segment.score_from
+
 
 def channel_names(image: str) -> list[str]:
     """``["normal.X", "normal.Y", "normal.Z"]`` of ``"normal"``."""

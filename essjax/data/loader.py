@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from essjax.data.augment import crop as crop_sequence
-from essjax.data.augment import flip
+from essjax.data.augment import flip, start_with_cut
 from essjax.data.layout import Dataset
 from essjax.data.store import read_segment
 from essjax.frames import Sequence, select_time
@@ -113,8 +113,7 @@ def make_clip(
     for direction, yes in zip(("horizontal", "vertical"), chosen, strict=True):
         if flips and yes:
             clip = flip(clip, direction)
-    cut = np.arange(length) == 0
-    return dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, cut=cut))
+    return start_with_cut(clip)
 
 
 def _stack(batch: Any) -> Sequence:

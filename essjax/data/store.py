@@ -13,6 +13,7 @@ import numpy as np
 
 from essjax.cameras import Camera
 from essjax.data import exr
+from essjax.data.augment import start_with_cut
 from essjax.data.layout import (
     SUFFIXES,
     Dataset,
@@ -296,8 +297,8 @@ def read_sequence(
     Args:
       dataset: from ``read_dataset``.
       name: of the sequence.
-      frames: numbers of the first and the last frame, both included; None: all. The first frame read is marked as a
-        cut, for what came before it is not there.
+      frames: numbers of the first and the last frame, both included; None: all. The first frame read becomes a
+        cut (``start_with_cut``), for what came before it is not there.
       native: read the native frames too, where there are any.
       threads: files read at the same time; None: one per core.
 
@@ -316,9 +317,7 @@ def read_sequence(
         )
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         parts = list(pool.map(lambda r: _read_frame(dataset.path, info, r, native and info.native), records))
-    sequence: Sequence = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-    sequence.frames.cut[0] = True
-    return sequence
+    return start_with_cut(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
 
 
 def read_segment(dataset: Dataset, segment: Segment, *, native: bool = True) -> Sequence:

@@ -73,6 +73,9 @@ def test_without_flips_and_crop_clips_are_windows_of_the_source():
             start = int(clip.frames.color[0, b, 0, 0, 2])
             np.testing.assert_array_equal(clip.frames.motion[:, b], source[0].frames.motion[start : start + 4])
             np.testing.assert_array_equal(clip.reference[:, b], source[0].reference[start : start + 4])
+            np.testing.assert_array_equal(clip.valid[1:, b], source[0].valid[start + 1 : start + 4])
+            np.testing.assert_array_equal(clip.valid[0, b], source[0].valid[start] if start == 0 else 0)
+    assert not source[0].frames.cut[1:].any() and source[0].valid[3].any()  # the source is not touched
 
 
 def test_no_clip_crosses_a_cut():

@@ -74,7 +74,10 @@ def test_a_range_of_frames_keeps_original_numbers_and_starts_with_a_cut(tmp_path
     back = read_segment(dataset, segment)
     np.testing.assert_array_equal(back.frames.motion, written.frames.motion[1:5])
     np.testing.assert_array_equal(back.frames.cut, [True, False, False, False])
-    assert segment.score_from == 11
+    np.testing.assert_array_equal(back.valid[1:], written.valid[2:5])
+    assert not back.valid[0].any()
+    assert dataset.numbers(segment) == (9, 10, 11, 12)
+    np.testing.assert_array_equal(dataset.scored(segment), [False, False, True, True])
     with pytest.raises(ValueError, match=r"sequence a: expected a range within the frames 8\.\.13, got 7\.\.9"):
         read_sequence(dataset, "a", (7, 9))
     with pytest.raises(ValueError, match="no sequence 'b'; there are a"):
