@@ -7,9 +7,14 @@ from essjax.scenes.builder import FLOOR, Builder, rotation
 
 
 def swing(b: Builder, amplitude: float, speed: float) -> np.ndarray:
-    """``[T]``: back and forth over ``amplitude`` (a length or an angle), at most ``speed`` per frame, random phase."""
-    phase = b.rng.uniform(0, 2 * np.pi)
-    return amplitude * np.sin(phase + np.arange(b.frames) * speed / amplitude)
+    """``[T]``: back and forth within ``amplitude`` (a length or an angle), random phase.
+
+    A rounded triangle wave: nearly always at ``speed`` per frame, so that few frames show no motion.
+    """
+    sharpness = 0.96
+    rate = 0.5 * np.pi * speed / (amplitude * sharpness)
+    wave = np.sin(b.rng.uniform(0, 2 * np.pi) + rate * np.arange(b.frames))
+    return amplitude * np.arcsin(sharpness * wave) / np.arcsin(sharpness)
 
 
 def turning(b: Builder, speed: float) -> np.ndarray:
@@ -67,7 +72,7 @@ def carousel(b: Builder) -> None:
     rng, colors = b.rng, presets.palette(b.rng)
     b.set_sky(ambient=0.4, clouds=0.6)
     b.rect(presets.planks(presets.shade(colors[0], 0.7)), (0, 0, 0), 12, 12, FLOOR)
-    b.rect(presets.bricks(colors[1], frequency=1.6), (0, 3, -5.5), 9, 3, None)
+    b.rect(presets.bricks(colors[1], frequency=1.6), (0, 3, -5.5), 14, 3, None)
     for k, x in enumerate((-4.4, 0.0, 4.4)):
         poster = (
             presets.glyphs((0.88, 0.84, 0.72), colors[2], frequency=4.0)
@@ -160,4 +165,4 @@ def gloss(b: Builder) -> None:
     b.sun((rng.uniform(-0.5, 0.5), 0.8, 0.5), (5.5, 4.6, 3.6))
     b.lamp((0, 3.4, -4.0), (20, 15, 12))
     eye = path(swing(b, 1.9, rng.uniform(0.12, 0.18)), 1.3 + swing(b, 0.3, 0.02), 4.2 + swing(b, 1.5, 0.08))
-    b.set_camera(eye, path(swing(b, 1.2, 0.1), 1.15, -4.0), focal=rng.uniform(0.85, 1.0))
+    b.set_camera(eye, path(rng.uniform(0.9, 1.3) * eye[:, 0] - 0.3, 1.15, -4.0), focal=rng.uniform(0.85, 1.0))

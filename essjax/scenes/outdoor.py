@@ -43,7 +43,7 @@ def grille(b: Builder) -> None:
         )
     b.sun((-0.5, 0.9, 0.35), (6.0, 5.5, 4.6))
     eye = path(swing(b, 2.0, rng.uniform(0.15, 0.2)), 1.25 + swing(b, 0.2, 0.02), 3.6 + swing(b, 0.5, 0.04))
-    b.set_camera(eye, path(swing(b, 1.0, 0.1), 1.3, -3.0), focal=rng.uniform(0.8, 0.95))
+    b.set_camera(eye, path(rng.uniform(1.0, 1.3) * eye[:, 0] + 0.4, 1.3, -3.0), focal=rng.uniform(0.8, 0.95))
 
 
 def shadows(b: Builder) -> None:
@@ -82,9 +82,9 @@ def shadows(b: Builder) -> None:
     place = path(2.6 * np.sin(fly), 2.4 + 0.4 * np.sin(2.3 * fly), -1.2 + 2.2 * np.cos(fly))
     b.lamp(place, (14, 19, 30))
     b.sphere(presets.lamp((0.6, 0.8, 1.0), 25.0), place + path(0, 0.13, 0), 0.1)
-    angle = swing(b, 0.5, 0.026)
+    angle = swing(b, 0.35, 0.018)
     eye = path(6.8 * np.sin(angle), 2.4 + swing(b, 0.3, 0.01), 6.6 * np.cos(angle))
-    b.set_camera(eye, path(swing(b, 0.5, 0.04), 1.1, -1.0), focal=rng.uniform(0.85, 1.0))
+    b.set_camera(eye, path(rng.uniform(0.8, 1.1) * eye[:, 0], 1.1, -1.0), focal=rng.uniform(0.85, 1.0))
 
 
 def texture(b: Builder) -> None:
@@ -114,7 +114,7 @@ def texture(b: Builder) -> None:
         b.sphere(makers[(k + 3) % 8](), place, size, rotation("y", turning(b, rng.uniform(-0.06, 0.06))))
     b.sun((rng.uniform(-0.7, 0.7), 1.0, 0.8), (6.0, 5.5, 4.8))
     eye = path(swing(b, 3.0, rng.uniform(0.16, 0.22)), 1.3 + swing(b, 0.25, 0.02), 3.2 + swing(b, 0.8, 0.05))
-    b.set_camera(eye, path(0.5 * eye[:, 0] + swing(b, 0.8, 0.05), 1.15, -3.0), focal=rng.uniform(0.85, 1.0))
+    b.set_camera(eye, path(rng.uniform(1.0, 1.3) * eye[:, 0] - 0.5, 1.15, -3.0), focal=rng.uniform(0.85, 1.0))
 
 
 def _square(b: Builder, colors) -> None:
@@ -180,7 +180,7 @@ def plaza(b: Builder) -> None:
     b.sun(sun, (8.0, 5.4, 3.4))
     angle = swing(b, 0.5, rng.uniform(0.028, 0.04))
     eye = path(7.2 * np.sin(angle), 1.7 + swing(b, 0.3, 0.012), 7.2 * np.cos(angle) + swing(b, 0.8, 0.04))
-    b.set_camera(eye, path(swing(b, 1.5, 0.1), 1.6, -2.0), focal=rng.uniform(0.75, 0.9))
+    b.set_camera(eye, path(0.7 * eye[:, 0], 1.6, -2.0), focal=rng.uniform(0.75, 0.9))
 
 
 def cuts(b: Builder) -> None:
@@ -191,7 +191,7 @@ def cuts(b: Builder) -> None:
     b.sun((0.5, 0.9, 0.4), (6.0, 5.6, 5.0))
     shots = []
     for k in range(4):
-        angle = rng.uniform(0, 2 * np.pi) + (1 if k % 2 else -1) * rng.uniform(0.012, 0.022) * np.arange(b.frames)
+        angle = rng.uniform(0, 2 * np.pi) + (1 if k % 2 else -1) * rng.uniform(0.03, 0.045) * np.arange(b.frames)
         reach, height = rng.uniform(4.0, 7.0), rng.uniform(0.8, 3.0)
         eye = path(reach * np.sin(angle), height, reach * np.cos(angle))
         target = path(swing(b, 0.8, 0.03), rng.uniform(0.8, 1.8), swing(b, 0.8, 0.03))
