@@ -127,10 +127,21 @@ def frame_path(root: Path, name: str, kind: str, number: int) -> Path:
     return Path(root) / name / f"{kind}.{number:04d}.exr"
 
 
+def _format(content: Mapping) -> str:
+    """One line per field and per record of a list; ``indent`` would put every number of a matrix on its own."""
+    lines = []
+    for key, value in content.items():
+        text = json.dumps(value)
+        if isinstance(value, (list, tuple)) and value and isinstance(value[0], Mapping):
+            text = "[\n  " + ",\n  ".join(map(json.dumps, value)) + "\n ]"
+        lines.append(f" {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
 def write_json(path: Path, content: Mapping) -> None:
     """Write JSON atomically."""
     with exr.atomic(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n")
+        temporary.write_text(_format(content), encoding="utf-8")
 
 
 def read_json(path: Path) -> dict:
@@ -173,7 +184,8 @@ def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
 
 def write_sequence_info(root: str | os.PathLike, info: SequenceInfo) -> None:
     """Write ``sequence.json`` atomically."""
-    write_json(Path(root) / info.name / "sequence.json", {"schema": SCHEMA, **dataclasses.asdict(info)})
+    fields = {field.name: getattr(info, field.name) for field in dataclasses.fields(info)}
+    write_json(Path(root) / info.name / "sequence.json", {"schema": SCHEMA, **fields})
 
 
 def whole(info: SequenceInfo) -> Segment:
