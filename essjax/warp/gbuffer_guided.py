@@ -41,7 +41,7 @@ def guides(gbuffers: GBuffers) -> Image:
 
 
 def _select(guide_previous: Array, guide: Array, x: Array, y: Array, inverse: Array) -> tuple[Array, ...]:
-    """Keys of the best candidates, four of ``[H, W]``, best first: cost bits with the candidate's number in the low 6."""
+    """Keys of the best candidates, four of ``[H, W]``, best first: cost bits, the low 6 a candidate's number."""
     height, width, channels = guide.shape
     # Costs are sums of squares of scaled differences. The border is +inf: a candidate there costs +inf and is never
     # usable, without any comparison of positions. One plane per channel, as gathers of single numbers are cheapest.

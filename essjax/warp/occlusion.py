@@ -13,6 +13,7 @@ from essjax.warp.splat import splat_nearest
 
 _MIN_N_DOT_V = 0.1
 _TYPICAL_N_DOT_V = 0.25  # where the channel is absent: towards grazing, so that floors are not holes
+_OFF_SCREEN = 1e9  # pixels: a splat drops what goes there
 _MIN_TAP_WEIGHT = 1e-3  # a tap that bilinear interpolation would ignore proves nothing
 
 
@@ -21,7 +22,8 @@ def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
 
     A disoccluded pixel's own motion leads to the occluder. Instead it takes the motion of the surface that stood there
     in the previous frame, so that the lookup lands beside the occluder, on background that was visible:
-    motion is splatted to t-1, nearest depth wins, and read at pixel + motion. Cracks of the splat (magnification) are
+    motion is splatted to t-1, nearest depth wins, and read at pixel + motion. Holes themselves are not splatted: they
+    were not visible there, and would show through the cracks that a splat leaves where t-1 was magnified. Cracks are
     filled from their nearest-depth neighbour; where that finds nothing either, the motion stays.
 
     Args:
@@ -33,7 +35,8 @@ def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
       ``[..., H, W, 2]``.
     """
     check_channels("hole", hole, 1, motion.shape[-3:-1])
-    splatted, covered = splat_nearest(jnp.concatenate([motion, depth], axis=-1), depth, motion)
+    visible_motion = jnp.where(hole < 0.5, _OFF_SCREEN, motion)
+    splatted, covered = splat_nearest(jnp.concatenate([motion, depth], axis=-1), depth, visible_motion)
     depth_there = jnp.where(covered > 0, splatted[..., 2:], jnp.inf)
     neighbour = dilate_motion(jnp.concatenate([splatted[..., :2], covered], axis=-1), depth_there)
     filled = jnp.where(covered > 0, splatted[..., :2], neighbour[..., :2])
@@ -86,10 +89,10 @@ def hole_mask(
     """Where the previous frame showed the same surface: three conditions on G-buffers (ExtraNet eq 8-10; SPEC 2).
 
     A pixel is a hole where the stencil differs; where it is dynamic (stencil > 0) and normals disagree; where it is
-    static and the world position moved by more than ``position_threshold`` footprints of a pixel, ``depth / (H * NoV)``,
-    which is scale-free (a vertical field of view near 53 degrees makes it exact); between sky and surface; off screen.
-    Sky to sky is valid. The previous frame is compared at the up to four pixels that bilinear interpolation
-    would read and the best match counts, so that thin things and silhouettes are not all holes.
+    static and the world position moved by more than ``position_threshold`` footprints of a pixel,
+    ``depth / (H * NoV)``, which is scale-free (a vertical field of view near 53 degrees makes it exact); between sky
+    and surface; off screen. Sky to sky is valid. The previous frame is compared at the up to four pixels that bilinear
+    interpolation would read and the best match counts, so that thin things and silhouettes are not all holes.
 
     Absent channels: without ``n_dot_v`` it counts as 0.25; without ``stencil`` everything counts as static; without
     ``world_position`` static pixels are compared by normal and by depth (relatively) instead - that of
