@@ -164,5 +164,5 @@ def gloss(b: Builder) -> None:
             b.sphere(presets.checker(color, (0.9, 0.9, 0.86), frequency=2.5), place, size, own)
     b.sun((rng.uniform(-0.5, 0.5), 0.8, 0.5), (5.5, 4.6, 3.6))
     b.lamp((0, 3.4, -4.0), (20, 15, 12))
-    eye = path(swing(b, 1.9, rng.uniform(0.12, 0.18)), 1.3 + swing(b, 0.3, 0.02), 4.2 + swing(b, 1.5, 0.08))
+    eye = path(swing(b, 1.9, rng.uniform(0.16, 0.24)), 1.3 + swing(b, 0.3, 0.02), 4.2 + swing(b, 1.5, 0.08))
     b.set_camera(eye, path(rng.uniform(0.9, 1.3) * eye[:, 0] - 0.3, 1.15, -4.0), focal=rng.uniform(0.85, 1.0))

@@ -42,7 +42,7 @@ def grille(b: Builder) -> None:
             presets.decorated(rng, colors[k], colors[k - 1], detail=1.2), run, size, rotation("z", turning(b, 0.12))
         )
     b.sun((-0.5, 0.9, 0.35), (6.0, 5.5, 4.6))
-    eye = path(swing(b, 2.0, rng.uniform(0.15, 0.2)), 1.25 + swing(b, 0.2, 0.02), 3.6 + swing(b, 0.5, 0.04))
+    eye = path(swing(b, 2.0, rng.uniform(0.18, 0.24)), 1.25 + swing(b, 0.2, 0.02), 3.6 + swing(b, 0.5, 0.04))
     b.set_camera(eye, path(rng.uniform(1.0, 1.3) * eye[:, 0] + 0.4, 1.3, -3.0), focal=rng.uniform(0.8, 0.95))
 
 

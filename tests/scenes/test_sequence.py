@@ -1,0 +1,160 @@
+import jax
+import numpy as np
+import pytest
+
+from essjax import frames, scenes, warp
+from essjax.color import reinhard
+from essjax.scenes import render
+
+SIZE = (36, 20)
+
+
+def leaves_equal(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.parametrize("family", scenes.FAMILIES)
+def test_scenes_are_deterministic_and_differ_by_seed(family):
+    scene = scenes.make_scene(family, 5, 6)
+    leaves_equal(scene.worlds, scenes.make_scene(family, 5, 6).worlds)
+    leaves_equal(scene.at(3), scenes.make_scene(family, 5, 14).at(3))  # a prefix of the longer animation
+    assert not np.array_equal(scene.worlds.to_local, scenes.make_scene(family, 6, 6).worlds.to_local)
+    assert scene.cut[0]
+
+
+def test_splits_are_disjoint_and_some_families_are_for_tests_only():
+    seeds = {split: set(scenes.split_seeds(split, 50, start=7)) for split in scenes.SPLITS}
+    assert all(len(s) == 50 for s in seeds.values()) and len(set.union(*seeds.values())) == 150
+    assert scenes.split_seeds("train", 2, start=3) == scenes.split_seeds("train", 5)[3:]
+    assert len(scenes.TEST_ONLY_FAMILIES) == 2 and len(scenes.TRAIN_FAMILIES) >= 6
+    assert set(scenes.families_of("test")) == set(scenes.FAMILIES)
+    for split in ("train", "validation"):
+        assert not set(scenes.families_of(split)) & set(scenes.TEST_ONLY_FAMILIES)
+    pairs = scenes.split_scenes("validation", 2)
+    assert len(pairs) == len(set(pairs)) == 2 * len(scenes.TRAIN_FAMILIES)
+
+
+def test_errors_say_what_to_do():
+    with pytest.raises(ValueError, match="expected one of corridor, .*, got 'forest'"):
+        scenes.make_scene("forest", 0, 4)
+    with pytest.raises(ValueError, match="frames >= 1, got seed 0 and 0 frames"):
+        scenes.make_scene("gloss", 0, 0)
+    with pytest.raises(ValueError, match="expected one of train, validation, test, got 'dev'"):
+        scenes.split_seeds("dev", 1)
+    scene = scenes.make_scene("gloss", 0, 2)
+    with pytest.raises(ValueError, match="0 <= frame < 2, got 2. Make a longer scene"):
+        scenes.render_frame(scene, 2, *SIZE)
+    with pytest.raises(ValueError, match="width: expected a whole number >= 1, got 0"):
+        scenes.render_frame(scene, 0, 0, 20)
+
+
+def test_sequence_is_valid_with_native_frames_and_resumes():
+    scene, done = scenes.make_scene("carousel", 3, 3), []
+    sequence = scenes.render_sequence(scene, *SIZE, spp=4, native=True, on_frame=done.append)
+    assert done == [0, 1, 2] and sequence.scale == 2
+    frames.validate_sequence(sequence, requires=frames.OPTIONAL_GBUFFERS)
+    assert sequence.frames.color.shape == (3, 20, 36, 3) and sequence.frames.color.dtype == np.float32
+    assert sequence.native.color.shape == (3, 40, 72, 3) and sequence.frames.gbuffers.stencil.dtype == np.int32
+    assert sequence.frames.gbuffers.stencil.max() > 3
+    np.testing.assert_array_equal(sequence.native.jitter, scenes.jitter_sequence(3, every_frame=True))
+    np.testing.assert_array_equal(sequence.frames.jitter, scenes.jitter_sequence(3))
+    assert list(sequence.frames.cut) == [True, False, False]
+    resumed = list(scenes.iterate_frames(scene, *SIZE, start=2, spp=4, native=True))
+    assert [n for n, _ in resumed] == [2]
+    leaves_equal(resumed[0][1], frames.select_time(sequence, 2))
+
+
+def test_nothing_recompiles_for_another_frame_size_or_family():
+    scenes.render_frame(scenes.make_scene("carousel", 3, 3), 1, *SIZE, spp=4)
+    sizes = render.color_along._cache_size(), render.buffers._cache_size()
+    scenes.render_frame(scenes.make_scene("gloss", 1, 4), 2, 41, 23, spp=9)
+    assert (render.color_along._cache_size(), render.buffers._cache_size()) == sizes
+
+
+def test_a_cut_ends_history():
+    scene = scenes.make_scene("cuts", 0, 40)
+    (cuts,) = np.nonzero(scene.cut)
+    assert len(cuts) >= 3 and cuts[0] == 0 and 6 <= cuts[1] <= 14
+    at_cut = scenes.render_frame(scene, int(cuts[1]), *SIZE, spp=1)
+    after = scenes.render_frame(scene, int(cuts[1]) + 1, *SIZE, spp=1)
+    assert at_cut.frames.cut and not after.frames.cut
+    assert not at_cut.valid.any() and after.valid.mean() > 0.7
+    np.testing.assert_allclose(at_cut.frames.motion, 0.0, atol=1e-2)
+
+
+def test_there_is_hdr_sky_and_glowing_matter():
+    s = scenes.render_frame(scenes.make_scene("plaza", 2, 2), 1, 96, 54, spp=4)
+    assert s.reference.max() > 8
+    sky = ~np.isfinite(s.frames.gbuffers.depth)
+    assert 0.05 < sky.mean() < 0.8
+
+
+def test_mip_bias_blurs_frames_but_not_the_reference():
+    scene = scenes.make_scene("texture", 4, 2)
+    sharp = scenes.render_frame(scene, 1, *SIZE, spp=4)
+    soft = scenes.render_frame(scene, 1, *SIZE, spp=4, mip_bias=4.0)
+    detail = lambda s: np.abs(np.diff(s.frames.gbuffers.base_color, axis=1)).mean()
+    assert detail(soft) < 0.7 * detail(sharp)
+    np.testing.assert_array_equal(sharp.reference, soft.reference)
+    np.testing.assert_array_equal(sharp.frames.motion, soft.frames.motion)
+
+
+def test_reference_converges():
+    world = scenes.make_scene("shadows", 2, 1).at(0)
+    x, y = render.screen_grid(*SIZE, np.zeros(2))
+    rng = np.random.default_rng(0)
+    angle = render.pixel_angle(world, SIZE[0])
+
+    def at(jitter):
+        a, b = render.screen_grid(*SIZE, jitter)
+        function = lambda a, b: {"c": render.color_along(world, a, b, angle)}
+        rays = render.chunk_size()
+        pad = (0, rays - a.size)
+        return np.asarray(function(np.pad(a, pad), np.pad(b, pad))["c"])[: a.size].reshape(SIZE[1], SIZE[0], 3)
+
+    mean = np.mean([at(rng.uniform(-0.5, 0.5, 2)) for _ in range(150)], axis=0)
+    error = lambda spp: np.sqrt(np.mean((render.render_reference(world, *SIZE, spp=spp) - mean) ** 2))
+    assert error(64) < 0.35 * error(1) and error(64) < 0.06 * mean.mean() + 0.03
+    assert x.shape == y.shape == (720,)
+
+
+def test_statistics_bound_the_reference_and_bumps_add_spread():
+    scene = scenes.make_scene("texture", 1, 2)
+    stats = scenes.subsample_statistics(scene, 1, *SIZE, spp=16)
+    reference = render.render_reference(scene.at(1), *SIZE, spp=16)
+    assert (stats["color_min"] <= reference + 1e-4).all() and (reference <= stats["color_max"] + 1e-4).all()
+    assert (stats["depth_min"] <= stats["depth_max"]).all()
+    assert stats["normal_spread"].shape == (20, 36, 1)
+    flat = stats["normal_spread_smooth"] == 0
+    assert flat.mean() > 0.2 and stats["normal_spread"][flat].mean() > 0.05
+    edge = (stats["depth_max"] - stats["depth_min"]) / stats["depth_max"] > 0.2
+    assert edge.any() and stats["normal_spread_smooth"][edge].mean() > stats["normal_spread_smooth"].mean()
+
+
+def gain(family, seed, index):
+    """PSNR (after x / (1 + x)) of the reference warped from the frame before, over that of not moving it, decibels."""
+    scene = scenes.make_scene(family, seed, index + 1)
+    width, height = 128, 72
+    before = render.render_reference(scene.at(index - 1), width, height, spp=16)
+    now = scenes.render_frame(scene, index, width, height, scale=1, spp=16)
+    mask = now.valid * now.steady
+    warped = np.asarray(warp.backward_warp(before, now.frames.motion))
+    target = np.asarray(reinhard(now.reference))
+    error = lambda image: (((np.asarray(reinhard(image)) - target) ** 2).mean(-1, keepdims=True) * mask).sum()
+    motion = np.linalg.norm(now.frames.motion, axis=-1)[mask[..., 0] == 1]
+    return 10 * np.log10(error(before) / error(warped)), np.median(motion), mask.mean()
+
+
+MOVING = {
+    "corridor": (0, 4), "carousel": (0, 4), "grille": (1, 4), "gloss": (1, 4), "shadows": (0, 4), "texture": (1, 4),
+    "plaza": (2, 4), "cuts": (1, 5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("family", scenes.FAMILIES)
+def test_exact_motion_beats_no_motion(family):
+    decibels, motion, share = gain(family, *MOVING[family])
+    assert motion > 2.0 / 192 * 128  # two pixels of the default 192
+    assert share > 0.4
+    assert decibels > 6.0
