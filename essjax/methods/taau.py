@@ -174,7 +174,7 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
 def taau(
     scale: int = 2,
     *,
-    alpha: float = 0.5,
+    alpha: float = 0.7,
     sigma: float = 0.8,
     clamp: str = "ycocg",
     dilate: bool = True,
@@ -186,6 +186,9 @@ def taau(
     dilated motion and clamped to the neighbourhood of the current samples, and both are blended with α β (eq 39, 42).
     Where there is no history (first frame, cut, off screen) it is the jitter-aligned upsampled frame, and α is at least
     1 / N (N: accumulated βs), so a new pixel first averages.
+
+    The defaults are the best of a grid on validation frames (built-in scenes 24.6 dB against 22.4 of ``bilinear`` after
+    ``color.display``; chess clip 31.4 against 29.2 after x / (1 + x)). Static scenes want a smaller alpha.
 
     ``variables`` are ``{"alpha", "sigma"}``, float32 scalars: a grid over them needs no new compilation.
 
@@ -207,7 +210,7 @@ def taau(
 def taau_half(
     scale: int = 2,
     *,
-    alpha: float = 0.5,
+    alpha: float = 0.7,
     sigma: float = 0.8,
     clamp: str = "ycocg",
     dilate: bool = True,
@@ -224,7 +227,7 @@ def taau_half(
 
 def taa(
     *,
-    alpha: float = 0.1,
+    alpha: float = 0.5,
     sigma: float = 0.5,
     clamp: str = "ycocg",
     dilate: bool = True,
