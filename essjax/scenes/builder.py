@@ -84,8 +84,8 @@ def between(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 class Builder:
     """Collects primitives, lights, sky and camera of a scene of ``frames`` frames.
 
-    Positions are ``[3]`` or ``[T, 3]`` metres, rotations ``[3, 3]`` or ``[T, 3, 3]``. Whatever is given a time axis gets
-    an id of its own in the stencil; the rest is static, id 0.
+    Positions are ``[3]`` or ``[T, 3]`` metres, rotations ``[3, 3]`` or ``[T, 3, 3]``. Whatever is given a time axis
+    gets an id of its own in the stencil; the rest is static, id 0.
     """
 
     def __init__(self, frames: int, rng: np.random.Generator):
@@ -157,9 +157,17 @@ class Builder:
         self.lights.append((np.broadcast_to(place, (self.frames, 3)), is_point, np.asarray(color, float)))
 
     def set_sky(
-        self, zenith=(0.25, 0.45, 0.9), horizon=(0.8, 0.9, 1.0), ground=(0.25, 0.22, 0.2), sun_direction=(0.3, 0.6, 0.5),
-        sun_color=(0.0, 0.0, 0.0), sun_size=0.002, clouds=0.5, cloud_frequency=3.0, ambient=0.6,
-    ) -> None:  # fmt: skip
+        self,
+        zenith=(0.25, 0.45, 0.9),
+        horizon=(0.8, 0.9, 1.0),
+        ground=(0.25, 0.22, 0.2),
+        sun_direction=(0.3, 0.6, 0.5),
+        sun_color=(0.0, 0.0, 0.0),
+        sun_size=0.002,
+        clouds=0.5,
+        cloud_frequency=3.0,
+        ambient=0.6,
+    ) -> None:
         """What rays see that hit nothing, and the ambient light that follows from it; see ``World.sky``."""
         sun = np.asarray(sun_direction, float)
         sun = sun / np.linalg.norm(sun)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.scenes.vec import Vec, dot, larger, normalize, smaller
-from essjax.scenes.world import BOX, CAPACITY, OFFSET, RECT, ROD, ROW_KIND, ROW_MEMBER, SPHERE, World
+from essjax.scenes.world import BOX, CAPACITY, OFFSET, RECT, ROD, ROW_KIND, ROW_MEMBER, SPHERE, World, columns
 from essjax.typing import Array, Callable, Float, Int
 
 FAR = 1e9
@@ -145,7 +145,8 @@ def trace(world: World, origin: Vec, direction: Vec, limit: Float[Array, "N"]) -
 
 def matrix_of(table: Float[Array, "P 12"], rows: Int[Array, "N"]) -> list[Array]:
     """The 12 entries of each ray's transform, planar."""
-    return [jnp.take(table[:, k], rows, mode="clip") for k in range(12)]
+    planar = columns(table, rows)
+    return [planar[k] for k in range(12)]
 
 
 def local_hit(m: list[Array], origin: Vec, direction: Vec, t: Array) -> Vec:

@@ -1,4 +1,7 @@
-"""Families with walls: corridor, carousel, gloss. Speeds are chosen in image widths per frame (0.01 is 2 pixels of 192)."""
+"""Families with walls: corridor, carousel, gloss.
+
+Metres and frames; speeds are chosen for 0.01 to 0.03 image widths per frame: 2 to 6 pixels of 192.
+"""
 
 import numpy as np
 

@@ -35,8 +35,8 @@ def jitter_sequence(length: int, *, period: int = 16, every_frame: bool = False)
 def reference_samples(count: int) -> np.ndarray:
     """Positions ``[count, 2]`` in [0, 1)^2 of the reference's samples in a pixel: a golden-ratio lattice.
 
-    As many distinct x as y, so that near-vertical and near-horizontal edges both get ``count`` shades; the same in every
-    pixel and frame, so that the reference does not flicker.
+    As many distinct x as y, so that near-vertical and near-horizontal edges both get ``count`` shades; the same in
+    every pixel and frame, so that the reference does not flicker.
     """
     index = np.arange(count)
     x, y = (index + 0.5) / count, (index * 0.6180339887498949 + 0.5 / count) % 1.0

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from essjax.scenes import geometry, textures
 from essjax.scenes.vec import Vec, dot, larger, mix, normalize, saturate, select, smaller, stage
-from essjax.scenes.world import COLUMNS, ROD, World, column
+from essjax.scenes.world import ROD, World, material_columns
 from essjax.typing import Array, Float, Int
 
 Rgb = tuple[float, float, float]
@@ -78,6 +78,7 @@ class Surface:
     Attributes:
       hit: bool.
       row: table row, -1 where nothing was hit.
+      id: stencil id, a float.
       local: hit point in the unit shape's space: a name for the material point that does not move.
       position: world, metres.
       normal: world, unit, with bump detail, facing the ray.
@@ -93,6 +94,7 @@ class Surface:
 
     hit: Array
     row: Array
+    id: Array
     local: Vec
     position: Vec
     normal: Vec
@@ -146,7 +148,7 @@ def surface(
       footprint: width of a pixel on a surface facing the ray, metres: what textures are filtered with.
     """
     run = jnp.any(rows >= 0)
-    at = {name: column(world, rows, name) for name in COLUMNS}
+    at = material_columns(world, rows)
     m = geometry.matrix_of(world.to_local, rows)
     place = stage(run, _place, at, m, origin, direction, t, footprint)
     frequency = at["grime_frequency"]
@@ -215,6 +217,7 @@ def _finish(at: dict[str, Array], m, rows: Array, place: _Place, noise, pattern,
     return Surface(
         hit=rows >= 0,
         row=rows,
+        id=at["id"],
         local=place.local,
         position=place.position,
         normal=normal,

@@ -178,7 +178,7 @@ def plaza(b: Builder) -> None:
         (2.6, 0.03, 1.3),
     )
     b.sun(sun, (8.0, 5.4, 3.4))
-    angle = swing(b, 0.5, rng.uniform(0.028, 0.04))
+    angle = swing(b, 0.5, rng.uniform(0.04, 0.055))
     eye = path(7.2 * np.sin(angle), 1.7 + swing(b, 0.3, 0.012), 7.2 * np.cos(angle) + swing(b, 0.8, 0.04))
     b.set_camera(eye, path(0.7 * eye[:, 0], 1.6, -2.0), focal=rng.uniform(0.75, 0.9))
 

