@@ -82,7 +82,6 @@ def unroll(
     train: bool = False,
     keep: Callable[[dict], PyTree] = lambda aux: {},
     remat: bool = False,
-    scan_unroll: int = 1,
 ) -> Rollout:
     """Run ``method`` over ``frames`` (leaves ``[T, ...]``, colour in every frame).
 
@@ -94,8 +93,6 @@ def unroll(
       train: passed to the steps.
       keep: chooses from each prediction's ``aux`` what to stack in time; nothing by default.
       remat: recompute the steps in the backward pass instead of storing their intermediates.
-      scan_unroll: periods per scan iteration; as many as there are avoids the loop (XLA:CPU differentiates
-        convolutions in a loop 20x slower, docs/adr/0006-unrolled-training-scan.md).
 
     Raises:
       ValueError: a buffer is missing, or the schedule extrapolates and the method cannot.
@@ -132,7 +129,7 @@ def unroll(
                 results.append(output)
             return history, tuple(results)
 
-        history, stacked = jax.lax.scan(scan_body, history, body, unroll=min(scan_unroll, pairs))
+        history, stacked = jax.lax.scan(scan_body, history, body)
         for pair in range(pairs):
             for k in range(schedule.period):
                 outputs.append((schedule.lead + pair * schedule.period + k, select_time(stacked[k], pair)))

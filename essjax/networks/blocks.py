@@ -4,6 +4,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from essjax.networks.convolution import scan_friendly_convolution
 from essjax.typing import Image
 
 
@@ -37,6 +38,11 @@ def bilinear_upsample(image: Image, factor: int = 2) -> Image:
     return jax.image.resize(image, (*lead, height * factor, width * factor, channels), "linear")
 
 
+def conv(features: int, size: int = 3, **options) -> nn.Conv:
+    """A stride-1 convolution, ``size`` x ``size``, zero padding, whose gradient is fast inside a scan."""
+    return nn.Conv(features, (size, size), conv_general_dilated=scan_friendly_convolution, **options)
+
+
 class ConvBlock(nn.Module):
     """``layers`` 3x3 convolutions, each followed by a leaky ReLU.
 
@@ -52,10 +58,10 @@ class ConvBlock(nn.Module):
     def __call__(self, x: Image) -> Image:
         """Return features ``[B, H, W, width]``."""
         for _ in range(self.layers):
-            x = nn.leaky_relu(nn.Conv(self.width, (3, 3))(x), 0.1)
+            x = nn.leaky_relu(conv(self.width)(x), 0.1)
         return x
 
 
 def zero_conv(channels: int) -> nn.Conv:
     """A 3x3 convolution that returns zero until it is trained: residuals and flows start at their prior."""
-    return nn.Conv(channels, (3, 3), kernel_init=nn.initializers.zeros)
+    return conv(channels, kernel_init=nn.initializers.zeros)

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from essjax.interfaces import Network
-from essjax.networks.blocks import ConvBlock, crop, mean_pool, nearest_upsample, pad_to_multiple, zero_conv
+from essjax.networks.blocks import ConvBlock, conv, crop, mean_pool, nearest_upsample, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen
 from essjax.typing import Image
 
@@ -42,7 +42,7 @@ class Decoder(nn.Module):
         """Decode the encoder's levels to ``[B, H, W, channels]``."""
         x = features[-1]
         for level in reversed(range(len(self.widths) - 1)):
-            reduced = nn.Conv(self.widths[level], (1, 1))(x)  # before upsampling: a quarter of the work
+            reduced = conv(self.widths[level], 1)(x)  # before upsampling: a quarter of the work
             joined = jnp.concatenate([nearest_upsample(reduced), features[level]], axis=-1)
             x = ConvBlock(self.widths[level], layers=2 if level else 1)(joined)
         return zero_conv(self.channels)(x)

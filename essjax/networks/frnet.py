@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from essjax.interfaces import Network
-from essjax.networks.blocks import ConvBlock, bilinear_upsample, crop, mean_pool, pad_to_multiple, zero_conv
+from essjax.networks.blocks import ConvBlock, bilinear_upsample, conv, crop, mean_pool, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen
 from essjax.typing import Image, Plane
 from essjax.warp import backward_warp
@@ -30,7 +30,7 @@ class FRNet(nn.Module):
         widths = [self.width, self.width * 3 // 2, self.width * 2]
         self.levels = [ConvBlock(w) for w in widths]
         self.decoders = [ConvBlock(w) for w in widths]
-        self.to_features = [nn.Conv(w, (3, 3)) for w in widths]
+        self.to_features = [conv(w) for w in widths]
         self.to_flow = [zero_conv(4) for _ in widths]
 
     def encode(self, image: Image, train: bool = False) -> list[Image]:

