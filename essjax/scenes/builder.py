@@ -73,7 +73,7 @@ def between(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     """Centre, rotation and half length of a rod from ``start`` to ``end`` (``[3]`` each)."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     axis = end - start
-    length = np.linalg.norm(axis)
+    length = float(np.linalg.norm(axis))
     z = axis / length
     helper = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = np.cross(helper, z)

@@ -11,7 +11,7 @@ from essjax.scenes.builder import Scene
 from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
 from essjax.scenes.world import World
-from essjax.typing import Array, Callable
+from essjax.typing import Callable
 
 _GBUFFERS = (
     "base_color", "normal", "depth", "roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v",
@@ -119,7 +119,7 @@ def render_sequence(
     return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
 
 
-def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, spp: int = 64) -> dict[str, Array]:
+def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, spp: int = 64) -> dict[str, np.ndarray]:
     """Ranges over the samples of each output pixel: what classifier labels are made of (Guo et al. 2022, section 2).
 
     Args:

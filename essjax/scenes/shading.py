@@ -92,7 +92,8 @@ def direct(world: World, s: Surface, view: Vec) -> Vec:
 def environment(world: World, s: Surface, direction: Vec) -> Vec:
     """Ambient light, and the blurred sky in what is not a traced mirror."""
     soft = s.base_color * (1.0 - s.metallic) * ambient(world, s.normal)
-    gloss = (1.0 - 0.7 * s.roughness) * jnp.where(s.mirror > 0.0, 0.0, 1.0)
+    # Twice: what stands around reflects light too, and metal that sees only the dim sky looks black.
+    gloss = (2.0 - 1.4 * s.roughness) * jnp.where(s.mirror > 0.0, 0.0, 1.0)
     return soft + reflectance_of(s) * ambient(world, reflect(direction, s.normal)) * gloss
 
 
