@@ -1,6 +1,7 @@
 """From a scene to the library's vocabulary: frames with all buffers, references and masks."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -75,13 +76,15 @@ def render_frame(
     world = scene.at(index)
     wide, high = width * scale, height * scale
     angle = pixel_angle(world, wide, mip_bias)
-    frame, valid, steady = _frame(scene, index, width, height, jitter_sequence(index + 1)[index], angle)
     native_frame = None
-    if native:
-        jitter = jitter_sequence(index + 1, every_frame=True)[index]
-        native_frame, _, _ = _frame(scene, index, wide, high, jitter, angle)
-    reference = render_reference(world, wide, high, spp=spp)
-    return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame)
+    # Beside the buffers, so that the two compilations of the first frame run at the same time.
+    with ThreadPoolExecutor(1) as beside:
+        reference = beside.submit(render_reference, world, wide, high, spp=spp)
+        frame, valid, steady = _frame(scene, index, width, height, jitter_sequence(index + 1)[index], angle)
+        if native:
+            jitter = jitter_sequence(index + 1, every_frame=True)[index]
+            native_frame, _, _ = _frame(scene, index, wide, high, jitter, angle)
+    return Sequence(frames=frame, reference=reference.result(), valid=valid, steady=steady, native=native_frame)
 
 
 def iterate_frames(
