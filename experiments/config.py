@@ -29,7 +29,7 @@ class Config:
     train_spp: int = 16
     test_spp: int = 64
     mip_bias: float = 0.0
-    clip: int = 6
+    clip: int = 7
     crop: tuple[int, int] = (48, 48)
     frnet_batch: int = 4
     batch: int = 4
@@ -53,13 +53,13 @@ class Config:
 
 PRESETS: dict[str, Config] = {
     "smoke": Config(
-        size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=4, crop=(32, 24),
+        size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=3, crop=(32, 24),
         batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None,
     ),
     "quick": Config(),
     "paper": Config(
         size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
-        train_spp=64, clip=8, crop=(128, 128), batch=12, frnet_batch=8, width=24, frnet_width=24,
+        train_spp=64, clip=9, crop=(128, 128), batch=12, frnet_batch=8, width=24, frnet_width=24,
         frnet_learning_rate=1e-4, learning_rate=4e-4, frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None,
         seconds=None, save_every=300.0, pictures=2,
     ),

@@ -1,0 +1,90 @@
+"""The rows of a run's table: which methods, with which variables, and what to tell the reader about them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from essjax.data import Dataset
+from essjax.typing import PyTree
+from experiments.config import Config
+from experiments.evaluate import Clip, Runner
+from experiments.tuning import Setting, setting_variables, tune
+from experiments.variants import PARTS, REFERENCES, VARIANTS, compared
+
+
+def make_runners(
+    name: str,
+    config: Config,
+    variables: PyTree,
+    validation: list[Clip],
+    out: Path,
+    on_step: Callable[[str], None] = lambda text: None,
+) -> tuple[dict[str, Runner], dict[str, Setting]]:
+    """Runners of the variant ``name`` and of what it is compared with; the TAA family is tuned on ``validation``.
+
+    The chosen settings are kept in ``out / "tuning.json"``: a resumed run does not search again.
+    """
+    native = validation[0].sequence.native is not None
+    runners, settings = {}, {}
+    kept = _read_settings(out / "tuning.json")
+    for row in compared(name):
+        variant = VARIANTS[row]
+        if row == "taa" and not native:
+            continue
+        if variant.tuned:
+            if row in kept:
+                settings[row] = kept[row]
+                method = variant.method(config, clamp=kept[row].clamp)
+            else:
+                on_step(f"tuning {row}")
+                settings[row], method, _ = tune(variant, config, validation)
+            runners[row] = Runner(method, setting_variables(settings[row]))
+        elif row in (name, *PARTS.get(name, ())):
+            method = variant.method(config)
+            entries = [stage.name for stage in variant.stages(config)]
+            runners[row] = Runner(method, {entry: variables[entry] for entry in entries})
+        else:
+            runners[row] = Runner(variant.method(config), {})
+    content = {row: setting._asdict() for row, setting in settings.items()}
+    (out / "tuning.json").write_text(json.dumps(content, indent=1) + "\n")
+    return runners, settings
+
+
+def _read_settings(path: Path) -> dict[str, Setting]:
+    if not path.exists():
+        return {}
+    return {row: Setting(**setting) for row, setting in json.loads(path.read_text()).items()}
+
+
+def table_references() -> dict[str, str]:
+    """Rows that are not on equal terms, and why."""
+    return dict(REFERENCES)
+
+
+def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], config: Config) -> list[str]:
+    """What the reader of the table must know."""
+    share = sum(clip.holes[clip.scored].mean() for clip in clips) / len(clips)
+    exact = "exact, from the renderer" if clips[0].exact_holes else "estimated from the G-buffers"
+    scored = sum(len(clip.scored) for clip in clips)
+    remarks = [
+        f"{scored} frames of {len(clips)} sequences are scored, each as SS and as ESS; {config.warmup} frames at the start "
+        f"and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR and SSIM after x/(1+x) and sRGB. "
+        "HR results score against the anti-aliased reference, LR results against that frame's own jittered, aliased colour.",
+    ]
+    for row, setting in settings.items():
+        remarks.append(
+            f"{row}: alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}, the best on the validation "
+            f"frames ({setting.psnr:.2f} dB there)."
+        )
+    if clips[0].sequence.native is None:
+        remarks.append("No taa row: this dataset has no colour at native resolution.")
+    if not clips[0].exact_holes:
+        remarks.append(_foreground_note())
+    return remarks
+
+
+def _foreground_note() -> str:
+    return (
+        "psnr_foreground leaves the background out; psnr_reference scores LR results against the reference read at the "
+        "sample positions (foreground): a noisy frame as target rewards denoising, that one does not. Both are in metrics.json."
+    )

@@ -1,0 +1,45 @@
+"""The data of a run: a dataset on disk that the user names, or scenes rendered into the run's folder."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from essjax.data import Dataset, read_dataset
+from essjax.generate import generate, plan
+from experiments.config import Config
+
+
+def prepare(config: Config, data: str | None, out: Path, progress: Callable[[int, int], None]) -> Dataset:
+    """Open ``data``, or render the built-in scenes into ``out / "scenes"`` (resumes; complete frames are kept).
+
+    Raises:
+      ValueError: the dataset lacks a split that a run needs, or was rendered with other settings.
+    """
+    if data is not None:
+        dataset = read_dataset(data)
+    else:
+        width, height = config.size
+        clips = [
+            *plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=config.seed),
+            *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp),
+            *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
+        ]
+        settings = {"scale": config.scale, "native": True, "mip_bias": config.mip_bias}
+        dataset = generate(out / "scenes", clips, width, height, progress=progress, **settings)
+    for split in ("train", "validation", "test"):
+        if not dataset.splits.get(split):
+            raise ValueError(
+                f"{dataset.path}: a run needs the splits train, validation and test; this dataset has "
+                f"{', '.join(dataset.splits) or 'none'}. Import it again with --train, --validation and --test."
+            )
+    return dataset
+
+
+def describe(dataset: Dataset) -> str:
+    """One line: size, scale, sequences and frames per split."""
+    info = dataset.info
+    parts = []
+    for split, segments in dataset.splits.items():
+        frames = sum(len(dataset.numbers(segment)) for segment in segments)
+        parts.append(f"{split} {len(segments)} sequences, {frames} frames")
+    size = f"{info.width}x{info.height} -> {info.width * info.scale}x{info.height * info.scale}"
+    return f"{size}; {'; '.join(parts)}"

@@ -1,0 +1,246 @@
+"""Run methods over the test frames, twice with swapped parity, and score every frame as SS and as ESS (SPEC 0)."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from essjax.cameras import pixel_positions
+from essjax.color import display
+from essjax.data import Dataset, Segment, read_segment
+from essjax.frames import Frame, Sequence, background, select_time, without_color
+from essjax.interfaces import Method
+from essjax.metrics import aggregate, psnr, score_rollout
+from essjax.rollout import ESS, SS, Schedule, alternate, check_supported, every, stream_step
+from essjax.typing import PyTree
+from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
+
+EXTRA_METRICS = ("psnr_foreground", "psnr_reference")
+"""Columns beside ``METRICS``: without the background (for LR results), and LR against the reference at the sample
+positions, foreground only, so that denoising is not mistaken for guidance."""
+
+
+@dataclasses.dataclass
+class Clip:
+    """One test sequence, ready to be scored; leaves ``[T, ...]``, no batch axis.
+
+    Attributes:
+      name: of the sequence.
+      sequence: its frames and references.
+      numbers: original frame numbers.
+      scored: indices that count.
+      holes: ``[T, H, W, 1]`` LR, 1 where the previous position is off screen or showed another surface.
+      exact_holes: whether they come from the renderer.
+    """
+
+    name: str
+    sequence: Sequence
+    numbers: tuple[int, ...]
+    scored: list[int]
+    holes: np.ndarray
+    exact_holes: bool
+
+
+def load_clip(dataset: Dataset, segment: Segment, warmup: int) -> Clip:
+    """Read a test segment; the first ``warmup`` frames and as many after each cut are not scored."""
+    sequence = read_segment(dataset, segment)
+    since_cut, scored = 0, []
+    for n, (cut, counts) in enumerate(zip(np.asarray(sequence.frames.cut), dataset.scored(segment), strict=True)):
+        since_cut = 0 if cut or n == 0 else since_cut + 1
+        if counts and since_cut >= warmup:
+            scored.append(n)
+    holes = 1.0 - np.asarray(_estimated_valid(sequence.frames) if sequence.valid is None else sequence.valid)
+    return Clip(segment.sequence, sequence, dataset.numbers(segment), scored, holes, sequence.valid is not None)
+
+
+@jax.jit
+def _estimated_valid(frames: Frame) -> jax.Array:
+    previous = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), frames)
+    return hole_mask(
+        frames.gbuffers, previous.gbuffers, frames.motion, jitter=frames.jitter, jitter_previous=previous.jitter
+    )
+
+
+class Runner:
+    """Steps a method frame by frame, as a stream does: one compilation per kind of frame and frame size."""
+
+    def __init__(self, method: Method, variables: PyTree):
+        self.method, self.variables = method, variables
+        self._steps = {kind: stream_step(method, kind) for kind in (SS, ESS)}
+        self._start = jax.jit(method.start)
+
+    def __call__(self, sequence: Sequence, schedule: Schedule) -> np.ndarray:
+        """Images ``[T, h, w, 3]`` of one sequence; image n is frame n's whatever the latency."""
+        frames = sequence.native if self.method.info.native else sequence.frames
+        if frames is None:
+            raise ValueError(f"{self.method.info.name} needs frames at native resolution, which this dataset lacks.")
+        check_supported(self.method, frames, schedule)
+        length = frames.motion.shape[0]
+        history, images = self._start(_batched(frames, 0)), []
+        for n, kind in enumerate(schedule.kinds(length)):
+            frame = _batched(frames, n)
+            frame = frame if kind == SS else without_color(frame)
+            history, image = self._steps[kind](self.variables, history, frame)
+            images.append(np.asarray(image[0]))
+        late = self.method.info.latency
+        return np.stack(images[late:] + images[-1:] * late)
+
+
+def _batched(frames: Frame, n: int) -> Frame:
+    return jax.tree.map(lambda leaf: leaf[None], select_time(frames, n))
+
+
+def schedules(method: Method) -> list[Schedule]:
+    """How a method is run: both parities, or every frame if it cannot extrapolate."""
+    return [every()] if method.info.renders_all else [alternate(0), alternate(1)]
+
+
+@functools.partial(jax.jit, static_argnames="scale")
+def reference_at_samples(reference: jax.Array, frames: Frame, scale: int) -> jax.Array:
+    """The reference read where each LR sample was taken, ``[T, H, W, 3]``."""
+    positions = scale * pixel_positions(*frames.motion.shape[-3:-1], frames.jitter)
+    return jnp.maximum(sample(reference, positions, mode="bilinear"), 0.0)
+
+
+@jax.jit
+def _masked_psnr(images: jax.Array, targets: jax.Array, mask: jax.Array) -> jax.Array:
+    return psnr(display(images), display(targets), mask=mask)
+
+
+def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str, ...]) -> list[dict[str, Any]]:
+    """One row per scored frame of a kind that the method predicts."""
+    frames, scale = clip.sequence.frames, clip.sequence.scale
+    low = images.shape[1:3] == frames.motion.shape[1:3] and not method.info.native
+    foreground = ~np.asarray(background(frames.gbuffers))
+    if low:
+        previous = np.concatenate([frames.jitter[:1], frames.jitter[:-1]])
+        targets, holes = np.asarray(frames.color), clip.holes
+        motion = jittered_motion(frames.motion, frames.jitter, previous)
+    else:
+        targets = np.asarray(clip.sequence.reference)
+        holes, foreground = (np.repeat(np.repeat(m, scale, 1), scale, 2) for m in (clip.holes, foreground))
+        motion = upsample_motion(frames.motion, scale, jitter=frames.jitter)
+    # All frames, so that every sequence has the same shape and compiles once; the warm-up is dropped below.
+    everything = list(range(len(kinds)))
+    rows = score_rollout(images, targets, scored=everything, kinds=kinds, holes=holes, motion=motion)
+    extra = {"psnr_foreground": _masked_psnr(images, targets, foreground)}
+    if low:
+        at_samples = reference_at_samples(clip.sequence.reference, frames, scale)
+        extra["psnr_reference"] = _masked_psnr(images, at_samples, foreground)
+    extra = {name: np.asarray(values) for name, values in extra.items()}
+    return [
+        {
+            "frame": clip.numbers[n],
+            "resolution": "lr" if low else "hr",
+            **rows[n],
+            **{name: float(values[n]) if np.isfinite(values[n]) else None for name, values in extra.items()},
+        }
+        for n in clip.scored
+        if kinds[n] in method.info.predicts
+    ]
+
+
+def picture_frames(clip: Clip, count: int) -> list[int]:
+    """Indices of the frames to show: those with the most holes among the scored ones."""
+    shares = clip.holes.mean(axis=(1, 2, 3))
+    return sorted(clip.scored, key=lambda n: -shares[n])[:count]
+
+
+def evaluate(
+    runners: Mapping[str, Runner],
+    clips: list[Clip],
+    *,
+    pictures: int = 1,
+    on_step: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Run and score every method on every clip.
+
+    Args:
+      runners: method name -> runner, in the order of the table.
+      clips: the test sequences.
+      pictures: chosen frames per sequence.
+      on_step: called before each (method, sequence).
+
+    Returns:
+      ``rows`` (per sequence and their mean, as metrics.json wants them), ``curves`` and ``pictures`` (as the report
+      wants them).
+    """
+    curves: dict[str, dict[str, list]] = {name: {} for name in runners}
+    shown: dict[tuple, dict] = {}
+    for clip in clips:
+        chosen = picture_frames(clip, pictures)
+        for name, runner in runners.items():
+            on_step(f"{name} on {clip.name}")
+            curves[name][clip.name] = []
+            for schedule in schedules(runner.method):
+                kinds = schedule.kinds(len(clip.numbers))
+                images = runner(clip.sequence, schedule)
+                rows = score_clip(runner.method, clip, images, kinds)
+                curves[name][clip.name] += rows
+                for n in chosen:
+                    _collect_picture(shown, clip, n, name, runner.method, images, kinds)
+    return {"rows": _summarise(curves), "curves": curves, "pictures": _ordered(shown)}
+
+
+def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, images: np.ndarray, kinds) -> None:
+    """Add a method's image of frame n to the pictures where it belongs (taau's and taa's to SS and ESS alike)."""
+    low = images.shape[1:3] == clip.sequence.frames.motion.shape[1:3] and not method.info.native
+    resolution = "lr" if low else "hr"
+    for kind in (SS, ESS) if method.info.renders_all else (kinds[n],):
+        if kind not in method.info.predicts and not method.info.renders_all:
+            continue
+        key = (clip.name, n, kind, resolution)
+        if key not in shown:
+            shown[key] = _new_picture(clip, n, kind, low)
+        shown[key]["images"][name] = images[n]
+        if n:
+            shown[key]["previous"][name] = images[n - 1]
+
+
+def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
+    frames, scale = clip.sequence.frames, 1 if low else clip.sequence.scale
+    target = frames.color if low else clip.sequence.reference
+    # What was rendered last: this frame, or the one before where this one is extrapolated.
+    inputs = {"images": n if kind == SS else n - 1, "previous": n - 1 if kind == SS else n - 1}
+    picture: dict[str, Any] = {
+        "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
+    }  # fmt: skip
+    for part, index in inputs.items():
+        color = np.repeat(np.repeat(np.asarray(frames.color[max(index, 0)]), scale, 0), scale, 1)
+        picture[part] = {"input": color, "reference": np.asarray(target[n if part == "images" else max(n - 1, 0)])}
+    return picture
+
+
+def _ordered(shown: Mapping[tuple, dict]) -> list[dict]:
+    """ESS at HR first, then SS, then LR; the report drops from the end what does not fit."""
+    order = {("hr", ESS): 0, ("hr", SS): 1, ("lr", ESS): 2, ("lr", SS): 3}
+    return sorted(shown.values(), key=lambda p: order[p["resolution"], p["kind"]])
+
+
+def _summarise(curves: Mapping[str, Mapping[str, list]]) -> list[dict[str, Any]]:
+    """Means over frames per sequence, and over sequences ("mean")."""
+    rows = []
+    for method, sequences in curves.items():
+        for kind in (SS, ESS):
+            per_sequence = []
+            for sequence, entries in sequences.items():
+                chosen = [entry for entry in entries if entry["kind"] == kind]
+                if chosen:
+                    per_sequence.append(_row(method, sequence, kind, chosen))
+            rows += per_sequence
+            if per_sequence:
+                rows.append(_row(method, "mean", kind, per_sequence))
+    return rows
+
+
+def _row(method: str, sequence: str, kind: str, entries: list[dict]) -> dict[str, Any]:
+    extra = {}
+    for name in EXTRA_METRICS:
+        values = [entry[name] for entry in entries if entry.get(name) is not None]
+        extra[name] = sum(values) / len(values) if values else None
+    labels = {"method": method, "sequence": sequence, "frames": kind, "resolution": entries[0]["resolution"]}
+    return {**labels, **aggregate(entries), **extra}

@@ -1,0 +1,62 @@
+"""``--profile``: a JAX profiler trace of the train step and of the streaming steps."""
+
+from pathlib import Path
+
+import jax
+from rich.console import Console
+
+from essjax.frames import select_time, without_color
+from essjax.generate import generate, plan
+from essjax.rollout import ESS, SS, stream_step
+from essjax.train import create_state, make_train_step, optimizer
+from experiments.config import Config
+from experiments.training import initial_variables, make_batches
+from experiments.variants import get_variant
+
+
+def write_profile(name: str, config: Config, out: Path, console: Console, *, repetitions: int = 5) -> int:
+    """Trace ``repetitions`` train steps of the last stage and as many SS/ESS pairs; compilation is not in the trace."""
+    variant = get_variant(name)
+    clips = plan("train", 1, max(config.clip, 3), spp=1, families=["carousel"])
+    dataset = generate(out / "profile-scenes", clips, *config.size, scale=config.scale)
+    folder = out / "profile"
+    stages = variant.stages(config)
+    if stages:
+        stage = stages[-1]
+        variables = initial_variables(stages, dataset, config)
+        transform = optimizer()
+        step = make_train_step(stage.objective, transform, stage.name)
+        state, batch = create_state(variables, stage.name, transform), next(make_batches(dataset, config, stage))
+        state, _ = step(state, batch, stage.learning_rate)
+        method, frames = stage.method, jax.tree.map(lambda leaf: leaf[:, :1], batch.frames)
+        variables = state.variables
+    else:
+        method = variant.method(config)
+        from essjax.data import disk_source
+
+        frames = jax.tree.map(lambda leaf: leaf[:, None], disk_source(dataset, "train")[0].frames)
+        variables = method.init(jax.random.key(0), select_time(frames, 0))
+    kinds = (SS,) if method.info.renders_all else (SS, ESS)
+    steps = {kind: stream_step(method, kind) for kind in kinds}
+    streamed = {SS: select_time(frames, 0), ESS: without_color(select_time(frames, 1))}
+    history = method.start(streamed[SS])
+    for kind in kinds:
+        history, _ = steps[kind](variables, history, streamed[kind])
+    jax.block_until_ready(history)
+    with jax.profiler.trace(str(folder)):
+        for repetition in range(repetitions):
+            for kind in kinds:
+                with jax.profiler.StepTraceAnnotation(f"stream {kind}", step_num=repetition):
+                    history, image = steps[kind](variables, history, streamed[kind])
+                    image.block_until_ready()
+        if stages:
+            for repetition in range(repetitions):
+                with jax.profiler.StepTraceAnnotation("train", step_num=repetition):
+                    state, terms = step(state, batch, stage.learning_rate)
+                    jax.block_until_ready(terms)
+    console.print(
+        f"trace: {folder}\nOpen it with `pip install xprof && xprof --logdir {folder}`, or load its *.trace.json.gz in "
+        "Perfetto.",
+        soft_wrap=True,
+    )
+    return 0

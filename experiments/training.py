@@ -1,0 +1,102 @@
+"""Train a variant: its stages in order, each resumable from its newest checkpoint."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from essjax.data import clips, disk_source
+from essjax.data.layout import Dataset
+from essjax.frames import select_time
+from essjax.train import Checkpoints, cosine, create_state, make_train_step, optimizer, train
+from essjax.typing import PyTree
+from experiments.config import Config
+from experiments.variants import Stage, Variant
+
+OnStep = Callable[[str, int, float, dict[str, float]], None]
+"""Called with stage, step, progress in [0, 1] and the terms."""
+
+
+def make_batches(dataset: Dataset, config: Config, stage: Stage):
+    """A grain iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, an odd number of frames.
+
+    Raises:
+      ValueError: no sequence is long enough for a clip.
+    """
+    info = dataset.info
+    width, height = (min(a, b) for a, b in zip(config.crop, (info.width, info.height), strict=True))
+    longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
+    length = min(config.clip, longest)
+    length -= 1 - length % 2  # SS/ESS pairs from frames 0 and 1 need an odd number
+    source = disk_source(dataset, "train")
+    return iter(clips(source, length=length, batch=stage.batch, crop=(height, width), seed=config.seed))
+
+
+def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> PyTree:
+    """Fresh variables of the last stage's method, which holds those of the stages before it."""
+    batch = next(make_batches(dataset, config, stages[-1]))
+    example = jax.tree.map(np.asarray, select_time(batch.frames, 0))
+    return stages[-1].method.init(jax.random.key(config.seed), example)
+
+
+def train_variant(
+    variant: Variant, dataset: Dataset, config: Config, out: Path, on_step: OnStep
+) -> tuple[PyTree, dict[str, Any]]:
+    """Train all stages; a stage with a checkpoint at the end of its budget is only restored.
+
+    Returns:
+      The variables, and stage -> ``{"steps", "seconds", "terms"}``.
+    """
+    stages = variant.stages(config)
+    variables, report = initial_variables(stages, dataset, config), {}
+    for stage in stages:
+        transform = optimizer()
+        # A stage sees only its own method's variables: a later stage's are not touched (nor saved) by an earlier one.
+        needed = {name: variables[name] for name in _entries(stages, stage)}
+        state = create_state(needed, stage.name, transform)
+        checkpoints = Checkpoints(out / "checkpoints" / stage.name)
+        try:
+            state, report[stage.name] = train(
+                make_train_step(stage.objective, transform, stage.name),
+                state,
+                make_batches(dataset, config, stage),
+                checkpoints,
+                out / "train" / f"{stage.name}.jsonl",
+                stage.budget,
+                lambda progress, peak=stage.learning_rate: cosine(progress, peak=peak),
+                save_every=config.save_every,
+                on_step=lambda step, progress, terms, name=stage.name: on_step(name, step, progress, terms),
+            )
+        finally:
+            checkpoints.close()
+        variables = {**variables, **state.variables}
+    return variables, report
+
+
+def restore_variant(variant: Variant, dataset: Dataset, config: Config, out: Path) -> tuple[PyTree, dict[str, Any]]:
+    """The variables of the newest checkpoint of the last stage, for ``--eval-only``.
+
+    Raises:
+      ValueError: there is none, or it does not fit the settings.
+    """
+    stages = variant.stages(config)
+    last = stages[-1]
+    variables = initial_variables(stages, dataset, config)
+    folder = out / "checkpoints" / last.name
+    if not folder.is_dir() or not os.listdir(folder):
+        raise ValueError(f"--eval-only: {folder} holds no checkpoint. Train first, or give the --out of a trained run.")
+    checkpoints = Checkpoints(folder)
+    try:
+        state, saved = checkpoints.restore(create_state(variables, last.name, optimizer()))
+    finally:
+        checkpoints.close()
+    return state.variables, {last.name: {"steps": int(state.step), "seconds": saved["seconds"], "terms": {}}}
+
+
+def _entries(stages: list[Stage], stage: Stage) -> list[str]:
+    """Names of the variables that ``stage`` needs: its own and those of the stages before it."""
+    names = [s.name for s in stages]
+    return names[: names.index(stage.name) + 1]

@@ -1,0 +1,99 @@
+"""Choose the settings of the TAA family on validation frames: a baseline is only worth beating at its best."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from essjax.color import display
+from essjax.frames import without_color
+from essjax.interfaces import Method
+from essjax.metrics import psnr
+from essjax.rollout import SS, check_supported
+from experiments.config import Config
+from experiments.evaluate import Clip, _batched, schedules
+from experiments.variants import Variant
+
+ALPHAS = (0.1, 0.2, 0.4, 0.7, 1.0)
+SIGMAS = (0.4, 0.5, 0.65, 0.8, 1.0)  # as many: one compilation serves both
+CLAMPS = ("none", "ycocg")
+FIRST_SIGMA = 0.65
+
+
+class Setting(NamedTuple):
+    """A TAA setting and its mean PSNR on the validation frames (dB)."""
+
+    clamp: str
+    alpha: float
+    sigma: float
+    psnr: float
+
+
+def tune(variant: Variant, config: Config, clips: list[Clip]) -> tuple[Setting, Method, dict[str, Any]]:
+    """For each clamp the best alpha, then for it the best sigma; returns the best setting, its method and variables."""
+    found: list[tuple[Setting, Method]] = []
+    for clamp in CLAMPS:
+        method = variant.method(config, clamp=clamp)
+        first = _best(method, clamp, [(alpha, FIRST_SIGMA) for alpha in ALPHAS], clips)
+        found.append((_best(method, clamp, [(first.alpha, sigma) for sigma in SIGMAS], clips), method))
+    best, method = max(found, key=lambda pair: pair[0].psnr)
+    return best, method, setting_variables(best)
+
+
+def setting_variables(setting: Setting) -> dict[str, Any]:
+    """The variables of a TAA method with this setting."""
+    return {"alpha": jnp.float32(setting.alpha), "sigma": jnp.float32(setting.sigma)}
+
+
+def _best(method: Method, clamp: str, settings: list[tuple[float, float]], clips: list[Clip]) -> Setting:
+    grid = np.array(settings, np.float32)
+    scores = np.mean([_score_grid(method, grid, clip) for clip in clips], axis=0)
+    top = int(np.argmax(scores))
+    return Setting(clamp, *settings[top], float(scores[top]))
+
+
+def _score_grid(method: Method, grid: np.ndarray, clip: Clip) -> np.ndarray:
+    """Mean PSNR ``[settings]`` over the scored frames of one clip, both kinds, all settings side by side."""
+    variables = {"alpha": jnp.asarray(grid[:, 0]), "sigma": jnp.asarray(grid[:, 1])}
+    frames = clip.sequence.native if method.info.native else clip.sequence.frames
+    assert frames is not None
+    steps = _steps(method)
+    totals, count = np.zeros(len(grid)), 0
+    for schedule in schedules(method):
+        check_supported(method, frames, schedule)
+        history = steps["start"](variables, _batched(frames, 0))
+        for n, kind in enumerate(schedule.kinds(len(clip.numbers))):
+            frame = _batched(frames, n)
+            history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
+            if n in clip.scored:
+                totals += np.asarray(_grid_psnr(image[:, 0], clip.sequence.reference[n]))
+                count += 1
+    return totals / max(count, 1)
+
+
+@jax.jit
+def _grid_psnr(images: jax.Array, target: jax.Array) -> jax.Array:
+    return jax.vmap(lambda image: psnr(display(image), display(target)))(images)
+
+
+_COMPILED: dict[Method, dict[str, Any]] = {}
+
+
+def _steps(method: Method) -> dict[str, Any]:
+    """Both steps, mapped over settings; compiled once per method."""
+    if method not in _COMPILED:
+
+        def mapped(step):
+            def run(variables, history, frame):
+                history, prediction = step(variables, history, frame)
+                return history, prediction.image
+
+            return jax.jit(jax.vmap(run, in_axes=(0, 0, None)))
+
+        _COMPILED[method] = {
+            "start": jax.jit(jax.vmap(lambda v, example: method.start(example), in_axes=(0, None))),
+            "ss": mapped(method.render_step),
+            "ess": mapped(method.extrapolate_step),
+        }
+    return _COMPILED[method]
