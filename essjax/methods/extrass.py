@@ -5,7 +5,6 @@ Pipeline: G-buffer guided warp (section 4.2), FRNet on the downsampled warp (4.3
 
 import dataclasses
 
-import chex
 import jax
 import jax.numpy as jnp
 
@@ -15,7 +14,7 @@ from essjax.interfaces import Method, MethodInfo, Network, no_variables, reset_a
 from essjax.methods.rendered import RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
-from essjax.typing import Array, Color, Image, Jitter, Mask, PyTree
+from essjax.typing import Array, Color, Image, Jitter, Mask, PyTree, pytree
 from essjax.warp import (
     backward_warp,
     hole_mask,
@@ -103,7 +102,7 @@ def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: floa
     return (similar & changed).astype(warped.dtype)
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Extrapolated:
     """What the low-resolution part of an ESS frame yields; all linear unless said otherwise.
 
@@ -169,7 +168,7 @@ def extrass_e(
     return Method(init, start_pair, render_step, extrapolate_step, info)
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class History:
     """The recurrent state of ``extrass``.
 
@@ -190,7 +189,7 @@ class History:
     empty: Array
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Warped:
     """f_r: the HR history warped to the current frame.
 
@@ -291,10 +290,13 @@ def extrass(
 
     def init(key, example):
         key_flow, key_net = jax.random.split(key)
-        history = start(example)
-        warped = warp_history(history, example, scale)
-        color = jnp.zeros_like(example.gbuffers.base_color)
-        inputs = [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
+
+        def both_inputs(example):
+            history, color = start(example), jnp.zeros_like(example.gbuffers.base_color)
+            warped = warp_history(history, example, scale)
+            return [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
+
+        inputs = [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(both_inputs, example)]  # only shapes matter
         return {
             "frnet": flow_network.init(key_flow, *_frnet_inputs(example)),
             "extrassnet": network.init(key_net, *inputs),

@@ -1,6 +1,7 @@
 """The seam to flax: a linen module becomes a ``Network`` of pure functions over plain dicts."""
 
 import flax.linen as nn
+import jax
 
 from essjax.interfaces import Network
 
@@ -13,6 +14,7 @@ def from_linen(module: nn.Module) -> Network:
       -> (output, state)``, where ``state`` holds new BatchNorm statistics when ``train`` and is {} otherwise.
     """
 
+    @jax.jit  # the forward pass is dead code there: nothing of it is compiled
     def init(key, *inputs):
         return module.init(key, *inputs, train=False)
 
