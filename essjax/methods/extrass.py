@@ -1,4 +1,4 @@
-"""ExtraSS (Wu et al. 2023): ``extrass_w``, ``extrass_e`` (low resolution, extrapolation) and ``extrass`` (both kinds, 2x).
+"""ExtraSS (Wu et al. 2023): ``extrass_w``, ``extrass_e`` (low resolution, extrapolation), ``extrass`` (both kinds, 2x).
 
 Pipeline: G-buffer guided warp (section 4.2), FRNet on the downsampled warp (4.3), ExtraSSNet (4.4).
 """
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import expm1, log1p
-from essjax.frames import Frame, GBuffers, Prediction, depth_scale, network_depth, select_time
+from essjax.frames import Frame, GBuffers, Prediction, depth_scale, network_depth, rendered_color, select_time
 from essjax.interfaces import Method, MethodInfo, Network, no_variables, reset_at_cut
 from essjax.methods.rendered import RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
 from essjax.networks import extrassnet, frnet
@@ -17,12 +17,12 @@ from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_mul
 from essjax.typing import Array, Color, Image, Jitter, Mask, PyTree, pytree
 from essjax.warp import (
     backward_warp,
+    depth_to_space,
     hole_mask,
     inside_mask,
     jitter_aligned_upsample,
     sample_distance,
     space_to_depth,
-    depth_to_space,
     upsample_motion,
 )
 
@@ -45,7 +45,7 @@ def extrass_w(
     """
 
     def render_step(variables, history, frame, *, train=False):
-        return _store(history, frame), Prediction(image=frame.color)
+        return _store(history, frame), Prediction(image=rendered_color(frame, info.name))
 
     def extrapolate_step(variables, history, frame, *, train=False):
         history = advance(reset_pair(frame.cut, start_pair(frame), history), frame)
@@ -157,7 +157,7 @@ def extrass_e(
         return {"frnet": network.init(key, *_frnet_inputs(example))}
 
     def render_step(variables, history, frame, *, train=False):
-        return _store(history, frame), Prediction(image=frame.color)
+        return _store(history, frame), Prediction(image=rendered_color(frame, info.name))
 
     def extrapolate_step(variables, history, frame, *, train=False):
         history = advance(reset_pair(frame.cut, start_pair(frame), history), frame)
@@ -233,7 +233,8 @@ EXTRAPOLATED_SHARE = 0.1
 """Share of the LR extrapolation on ESS frames, where history is trusted."""
 
 
-def _sample_weight(frame: Frame, height: int, width: int, scale: int) -> Array:
+def _sample_weight(frame: Frame, scale: int) -> Array:
+    height, width = frame.motion.shape[-3:-1]
     distance = sample_distance(height, width, scale, frame.jitter)
     squared = jnp.sum(distance**2, axis=-1, keepdims=True)
     return SAMPLE_SHARE * jnp.exp(-0.5 * squared / SAMPLE_SIGMA**2) + 0.02
@@ -296,7 +297,7 @@ def extrass(
             warped = warp_history(history, example, scale)
             return [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
 
-        inputs = [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(both_inputs, example)]  # only shapes matter
+        inputs = jax.eval_shape(both_inputs, example)  # only shapes matter
         return {
             "frnet": flow_network.init(key_flow, *_frnet_inputs(example)),
             "extrassnet": network.init(key_net, *inputs),
@@ -334,9 +335,10 @@ def extrass(
     def render_step(variables, history, frame, *, train=False):
         history = reset(frame, history)
         warped = warp_history(history, frame, scale)
-        inputs, aligned = _inputs(frame, history, warped, frame.color, _extras(frame, frame.color)[0])
+        color = rendered_color(frame, info.name)
+        inputs, aligned = _inputs(frame, history, warped, color, _extras(frame, color)[0])
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
-        weight = _sample_weight(frame, *frame.motion.shape[-3:-1], scale)
+        weight = _sample_weight(frame, scale)
         log_image = _compose(head, warped, aligned, weight, scale)
         rendered = push(advance(history.rendered, frame), frame)
         history, image = _finish(history, frame, rendered, log_image)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.networks.convolution import scan_friendly_convolution
+from essjax.networks.linen import kernel_deviation
 from essjax.typing import Image
 
 
@@ -40,6 +41,8 @@ def bilinear_upsample(image: Image, factor: int = 2) -> Image:
 
 def conv(features: int, size: int = 3, **options) -> nn.Conv:
     """A stride-1 convolution, ``size`` x ``size``, zero padding, whose gradient is fast inside a scan."""
+    options = {"kernel_init": nn.initializers.he_uniform(), **options}
+    options = {"kernel_init": kernel_deviation, **options}
     return nn.Conv(features, (size, size), conv_general_dilated=scan_friendly_convolution, **options)
 
 

@@ -9,13 +9,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from essjax.typing import Array
-
 _NHWC = ("NHWC", "HWIO", "NHWC")
 
 
 @jax.custom_vjp
-def _convolve(x: Array, kernel: Array) -> Array:
+def _convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
     return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=_NHWC)
 
 
@@ -27,7 +25,7 @@ def _backward(residuals, gradient):
     x, kernel = residuals
     flipped = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
     dx = lax.conv_general_dilated(gradient, flipped, (1, 1), "SAME", dimension_numbers=_NHWC)
-    # The kernel's gradient correlates input and output gradient: channels take the batch's place, the image the kernel's.
+    # The kernel's gradient correlates input and output gradient: channels stand in for the batch, the image for the kernel.
     height, width = kernel.shape[0] // 2, kernel.shape[1] // 2
     dw = lax.conv_general_dilated(
         jnp.transpose(x, (3, 1, 2, 0)),
