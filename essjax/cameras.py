@@ -5,13 +5,12 @@ The camera looks along its -Z with +Y up (as Blender, glTF, OpenGL); the image h
 Depth is ``-Z``, positive, linear; the background is +inf. All functions take any leading axes.
 """
 
-import chex
 import jax.numpy as jnp
 
-from essjax.typing import Array, Float, Matrix4, Motion, Plane, Positions, Vectors
+from essjax.typing import Array, Float, Matrix4, Motion, Plane, Positions, Vectors, pytree
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Camera:
     """A pinhole camera; lengths in pixels of the frame that it belongs to.
 

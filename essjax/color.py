@@ -47,7 +47,7 @@ def expm1(encoded: Image) -> Image:
 
 
 def reinhard(color: Image) -> Image:
-    """x / (1 + x): [0, inf) to [0, 1). Negative input counts as 0."""
+    """Compress by x / (1 + x): [0, inf) to [0, 1). Negative input counts as 0."""
     color = jnp.maximum(color, 0.0)
     return color / (1.0 + color)
 

@@ -1,22 +1,23 @@
 """The vocabulary: GBuffers, Frame, Sequence, Prediction, and the checks that stand where user data enters.
 
-Shapes are those of one image; any leading axes may stand in front: ``[H, W, C]``, ``[B, H, W, C]``, ``[T, B, H, W, C]``.
+Shapes are those of one image; any leading axes may stand in front: ``[H, W, C]``, ``[B, H, W, C]``,
+``[T, B, H, W, C]``.
 All are frozen pytrees: change a field with ``dataclasses.replace``. ``None`` means the channel does not exist.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree, Scalar, Vectors
+from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree, Scalar, Vectors, pytree
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class GBuffers:
     """What the rasteriser knows without shading, at the jittered sample positions.
 
@@ -43,7 +44,7 @@ class GBuffers:
     n_dot_v: Plane | None = None
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Frame:
     """One frame as a method sees it.
 
@@ -69,7 +70,7 @@ class Frame:
     reactive: Plane | None = None
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Sequence:
     """Frames stacked in time, with what they are scored against. Leading axes ``[T, ...]``.
 
@@ -96,7 +97,7 @@ class Sequence:
         return self.reference.shape[-3] // self.frames.motion.shape[-3]
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Prediction:
     """What a step returns.
 
@@ -124,6 +125,23 @@ def frame_images(frame: Frame) -> dict[str, jax.Array | np.ndarray]:
     images = {"color": frame.color, "motion": frame.motion, "reactive": frame.reactive}
     images |= {field.name: getattr(frame.gbuffers, field.name) for field in dataclasses.fields(frame.gbuffers)}
     return {name: image for name, image in images.items() if image is not None}
+
+
+def gbuffers_of(images: Mapping[str, Any]) -> GBuffers:
+    """G-buffers picked by name from ``images``, which may hold more; optional ones that are absent become None.
+
+    Raises:
+      KeyError: base colour, normal or depth is missing.
+    """
+    optional = {name: images.get(name) for name in OPTIONAL_GBUFFERS}
+    return GBuffers(base_color=images["base_color"], normal=images["normal"], depth=images["depth"], **optional)
+
+
+def rendered_color(frame: Frame, name: str) -> Color:
+    """The colour of a rendered frame; a ValueError that names the method ``name`` if it has none."""
+    if frame.color is None:
+        raise ValueError(f"{name}: a rendered step needs the frame's colour, got None. Call its extrapolate_step.")
+    return frame.color
 
 
 def require(frame: Frame, names: Iterable[str], method: str) -> None:

@@ -2,13 +2,12 @@
 
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 
 from essjax.frames import Frame, check_shapes, require, select_time, without_color
 from essjax.interfaces import Method
-from essjax.typing import Array, Callable, PyTree
+from essjax.typing import Array, Callable, PyTree, pytree
 
 SS, ESS = "ss", "ess"
 
@@ -33,7 +32,7 @@ def every() -> Schedule:
 
 
 def alternate(parity: int = 0) -> Schedule:
-    """Every other frame is rendered: parity 0 renders 0, 2, 4 ..., parity 1 renders 0 (warm-up), 1, 3, 5 ... (SPEC 0)."""
+    """Every other frame is rendered: parity 0 renders 0, 2, 4 ..., parity 1 renders 0 (warm-up), 1, 3, 5 ..."""
     if parity not in (0, 1):
         raise ValueError(f"parity: expected 0 or 1, got {parity!r}.")
 
@@ -43,7 +42,7 @@ def alternate(parity: int = 0) -> Schedule:
     return Schedule(kinds, 2, parity)
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Rollout:
     """What ``unroll`` returns, time-major.
 
@@ -164,7 +163,7 @@ def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
 
 
 def stream_step(method: Method, kind: str) -> Callable:
-    """One jitted step, history donated: ``(variables, history, frame) -> (history, image)``. The streaming loop calls it."""
+    """One jitted step for streaming, history donated: ``(variables, history, frame) -> (history, image)``."""
 
     def step(variables, history, frame):
         history, prediction = _step(method, variables, history, frame, kind, train=False)

@@ -1,10 +1,16 @@
 """Array aliases with named axes. ``...`` stands for any leading (time, batch) axes."""
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast, dataclass_transform
 
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+import chex
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
+Array = jax.Array | np.ndarray
+"""On a device or on the host: data and scenes make NumPy arrays, jitted code takes both and makes JAX arrays."""
 Image = Float[Array, "... h w c"]
 """Linear HDR colour or features, row 0 on top."""
 Color = Float[Array, "... h w 3"]
@@ -30,7 +36,20 @@ Key = PRNGKeyArray
 PyTree = Any
 """A pytree of arrays: variables, history, optimiser state."""
 
+_T = TypeVar("_T")
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(dataclasses.field,))
+def pytree(cls: type[_T]) -> type[_T]:
+    """Class decorator: a frozen, keyword-only ``chex.dataclass`` that JAX sees as a pytree.
+
+    Type checkers read it as a dataclass (they do not know chex's decorator); change a field with
+    ``dataclasses.replace``.
+    """
+    return cast(type[_T], chex.dataclass(cls, frozen=True, kw_only=True, mappable_dataclass=False))
+
+
 __all__ = [
     "Array", "Bool", "Callable", "Color", "Flag", "Float", "Ids", "Image", "Int", "Jitter", "Key", "Mask", "Matrix4",
-    "Motion", "Plane", "Positions", "PyTree", "Scalar", "Vectors",
+    "Motion", "Plane", "Positions", "PyTree", "Scalar", "Vectors", "pytree",
 ]  # fmt: skip

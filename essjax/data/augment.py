@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.frames import Frame, GBuffers, Sequence, frame_images
+from essjax.frames import Frame, Sequence, frame_images, gbuffers_of
 
-_GBUFFERS = tuple(field.name for field in dataclasses.fields(GBuffers))
 _AXES = {"horizontal": 0, "vertical": 1}
 _MIRRORED = {"motion": 2, "normal": 3, "world_position": 3}
 """Images whose component along the flipped axis changes sign, with their number of components."""
@@ -20,7 +19,7 @@ def _map_images(frame: Frame, transform: Callable[[str, np.ndarray], np.ndarray]
     return dataclasses.replace(
         frame,
         color=images.get("color"),
-        gbuffers=GBuffers(**{name: images.get(name) for name in _GBUFFERS}),
+        gbuffers=gbuffers_of(images),
         motion=images["motion"],
         reactive=images.get("reactive"),
     )

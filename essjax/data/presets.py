@@ -19,6 +19,7 @@ from essjax.data import exr
 from essjax.data.layout import Dataset, Segment, SequenceInfo, read_json, write_dataset
 from essjax.data.store import SequenceWriter
 from essjax.frames import Frame, GBuffers
+from essjax.typing import Jitter, Motion, Plane
 
 BLENDER_BACKGROUND = 1e9
 """Blender writes 1e10 as the depth of the background."""
@@ -164,7 +165,7 @@ def _lr(dump: _Dump, number: int) -> _Passes:
 
 
 @jax.jit
-def _static_motion(camera: Camera, previous: Camera, jitter: jax.Array, depth: jax.Array) -> jax.Array:
+def _static_motion(camera: Camera, previous: Camera, jitter: Jitter, depth: Plane) -> Motion:
     height, width = depth.shape[:2]
     return static_motion(camera, previous, pixel_positions(height, width, jitter), depth)
 
@@ -268,7 +269,7 @@ def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> tuple[Frame,
         motion=np.where(hit & ~mixed, vector, static).astype(np.float32),
         jitter=jitter,
         cut=np.asarray(number - 1 not in dump.cameras),
-        exposure=np.float32(1.0),
+        exposure=np.ones((), np.float32),
         camera=camera,
     )
     counts = {

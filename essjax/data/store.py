@@ -27,10 +27,9 @@ from essjax.data.layout import (
     whole,
     write_sequence_info,
 )
-from essjax.frames import Frame, GBuffers, Sequence, frame_images, select_time, validate_frame
+from essjax.frames import Frame, Sequence, frame_images, gbuffers_of, select_time, validate_frame
 
 MASKS = ("valid", "steady")
-_GBUFFERS = tuple(field.name for field in dataclasses.fields(GBuffers))
 
 
 def _plain(content: Any) -> Any:
@@ -250,7 +249,7 @@ def _make_camera(record: Mapping | None) -> Camera | None:
 def _make_frame(images: Mapping[str, np.ndarray], record: Mapping, prefix: str = "") -> Frame:
     return Frame(
         color=images["color"],
-        gbuffers=GBuffers(**{name: images.get(name) for name in _GBUFFERS}),
+        gbuffers=gbuffers_of(images),
         motion=images["motion"],
         jitter=np.asarray(record[f"{prefix}jitter"], np.float32),
         cut=np.asarray(record["cut"], bool),

@@ -6,17 +6,10 @@ import math
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse
-from essjax.frames import Frame, Prediction
+from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, no_variables, reset_at_cut
 from essjax.typing import Array, Callable, Image, PyTree
 from essjax.warp import backward_warp, compose_motion, jitter_aligned_upsample, jittered_motion
-
-
-def rendered_color(frame: Frame, name: str) -> Array:
-    """The frame's colour; a ValueError if it has none."""
-    if frame.color is None:
-        raise ValueError(f"{name}: a rendered step needs the frame's colour, got None. Call its extrapolate_step.")
-    return frame.color
 
 
 def jau_image(frame: Frame, scale: float, mode: str = "bilinear") -> Array:

@@ -1,19 +1,18 @@
-"""The two latest rendered frames and the path back to them: the low-resolution memory of ExtraSS (sections 4.2, 4.3)."""
+"""The two latest rendered frames and the paths back to them: ExtraSS's low-resolution memory (sections 4.2, 4.3)."""
 
 import dataclasses
 
-import chex
 import jax
 import jax.numpy as jnp
 
 from essjax.color import demodulate, demodulation_albedo, modulate
-from essjax.frames import Frame, GBuffers, background
+from essjax.frames import Frame, GBuffers, background, rendered_color
 from essjax.interfaces import expand_flag, reset_at_cut
-from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion
+from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, pytree
 from essjax.warp import compose_motion, gbuffer_guided_warp, guides, jittered_motion
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Rendered:
     """Rendered frames and the paths from the latest frame back to them; [2, ...]: the newest and the older one.
 
@@ -32,7 +31,7 @@ class Rendered:
     valid: Mask
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class RenderedPair:
     """The two latest rendered frames.
 
@@ -55,7 +54,7 @@ def albedo(gbuffers: GBuffers) -> Color:
 def _remember(frame: Frame) -> Rendered:
     """A frame that was just rendered: no way back to go."""
     return Rendered(
-        shading=demodulate(frame.color, albedo(frame.gbuffers)),
+        shading=demodulate(rendered_color(frame, "extrass"), albedo(frame.gbuffers)),
         guide=guides(frame.gbuffers),
         jitter=frame.jitter,
         motion=jnp.zeros_like(frame.motion),
@@ -72,7 +71,11 @@ def start_pair(example: Frame) -> RenderedPair:
 
 def reset_pair(cut: Flag, fresh: RenderedPair, pair: RenderedPair) -> RenderedPair:
     """``fresh`` where ``cut``: ``interfaces.reset_at_cut`` for leaves that carry the pair's axis in front."""
-    frames = jax.tree.map(lambda new, old: jnp.where(expand_flag(cut, new.ndim - 1), new, old), fresh.frames, pair.frames)
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(expand_flag(cut, new.ndim - 1), new, old)
+
+    frames = jax.tree.map(choose, fresh.frames, pair.frames)
     rest = {name: reset_at_cut(cut, getattr(fresh, name), getattr(pair, name)) for name in ("count", "jitter")}
     return RenderedPair(frames=frames, **rest)
 

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
-from essjax.frames import Frame, Prediction
+from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
-from essjax.methods.baselines import rendered_color
 from essjax.typing import Array, Image, Jitter, Mask, PyTree
 from essjax.warp import backward_warp, dilate_motion, inside_mask, jitter_aligned_upsample, upsample_motion
 

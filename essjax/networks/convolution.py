@@ -25,7 +25,8 @@ def _backward(residuals, gradient):
     x, kernel = residuals
     flipped = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
     dx = lax.conv_general_dilated(gradient, flipped, (1, 1), "SAME", dimension_numbers=_NHWC)
-    # The kernel's gradient correlates input and output gradient: channels stand in for the batch, the image for the kernel.
+    # The kernel's gradient correlates input and output gradient: channels take the place of the batch, the image that
+    # of the kernel.
     height, width = kernel.shape[0] // 2, kernel.shape[1] // 2
     dw = lax.conv_general_dilated(
         jnp.transpose(x, (3, 1, 2, 0)),

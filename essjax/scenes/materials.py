@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import chex
 import jax
 import jax.numpy as jnp
 
 from essjax.scenes import geometry, textures
 from essjax.scenes.vec import Vec, dot, larger, mix, normalize, saturate, select, smaller, stage
 from essjax.scenes.world import ROD, World, material_columns
-from essjax.typing import Array, Float, Int
+from essjax.typing import Array, Float, Int, pytree
 
 Rgb = tuple[float, float, float]
 
@@ -71,7 +70,7 @@ class Material:
         }  # fmt: skip
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Surface:
     """What a ray found, one value per ray.
 
@@ -157,7 +156,7 @@ def surface(
     return stage(run, _finish, at, m, rows, place, noise, pattern, direction)
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class _Place:
     """Where on which texture a ray ends."""
 

@@ -7,16 +7,12 @@ import jax
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.frames import Frame, GBuffers, Sequence
+from essjax.frames import Frame, Sequence, gbuffers_of
 from essjax.scenes.builder import Scene
 from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
 from essjax.scenes.world import World
 from essjax.typing import Callable
-
-_GBUFFERS = (
-    "base_color", "normal", "depth", "roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v",
-)  # fmt: skip
 
 
 def _camera(world: World, width: int, height: int) -> Camera:
@@ -40,11 +36,11 @@ def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray
         images["valid"] = np.zeros_like(images["valid"])
     frame = Frame(
         color=images["color"],
-        gbuffers=GBuffers(**{name: images[name] for name in _GBUFFERS}),
+        gbuffers=gbuffers_of(images),
         motion=images["motion"],
         jitter=jitter,
         cut=np.asarray(scene.cut[index]),
-        exposure=np.float32(1.0),
+        exposure=np.ones((), np.float32),
         camera=_camera(world, width, height),
     )
     return frame, images["valid"], images["steady"]

@@ -1,13 +1,12 @@
 """Planar 3-vectors: one array per component, so that XLA fuses ray arithmetic into a few vectorised loops."""
 
-import chex
 import jax
 import jax.numpy as jnp
 
-from essjax.typing import Array, Callable, PyTree
+from essjax.typing import Array, Callable, PyTree, pytree
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class Vec:
     """Three arrays ``[...]`` of equal (or broadcastable) shape: a vector or a colour per ray."""
 

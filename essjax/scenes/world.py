@@ -5,11 +5,10 @@ cylinder along z, all inside [-1, 1]^3. A table row holds one primitive. The fou
 ranges of rows, of which the first ``counts[kind]`` are used: counts are data, so one compilation renders every scene.
 """
 
-import chex
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.typing import Array, Float, Int
+from essjax.typing import Array, Float, Int, pytree
 
 RECT, BOX, SPHERE, ROD = range(4)
 CAPACITY = (16, 48, 24, 64)
@@ -34,7 +33,7 @@ COLUMNS = (
 COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class World:
     """One instant of a scene. Metres; y is up; camera as in ``essjax.cameras``.
 

@@ -106,7 +106,8 @@ def _raise_non_finite(step: int, terms: dict[str, float], batch: Any, folder: Pa
     names = [name for name, value in terms.items() if not np.isfinite(value) and name != "loss"]
     path = folder / f"non_finite_batch_{step}.npz"
     leaves, _ = jax.tree_util.tree_flatten_with_path(batch)
-    np.savez_compressed(path, **{jax.tree_util.keystr(key).strip("."): np.asarray(leaf) for key, leaf in leaves})
+    arrays: dict[str, Any] = {jax.tree_util.keystr(key).strip("."): np.asarray(leaf) for key, leaf in leaves}
+    np.savez_compressed(path, **arrays)
     raise NonFiniteLoss(
         f"step {step}: not finite: {', '.join(names)}. The batch is in {path}; the last checkpoint is from before it. "
         "Check the data (NaN, negative or huge radiance) or lower the learning rate."

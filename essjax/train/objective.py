@@ -6,12 +6,13 @@ history). Losses are on log(1 + x).
 """
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 from essjax.color import expm1, log1p
-from essjax.frames import Sequence
+from essjax.frames import Sequence, rendered_color
 from essjax.interfaces import Method, Network
 from essjax.losses import (
     census,
@@ -43,7 +44,7 @@ def both_kinds(method: Method, variables: PyTree, clip: Sequence, keep: Callable
     """
     length = clip.frames.motion.shape[0]
     if length < 3 or length % 2 == 0:
-        raise ValueError(f"clip: expected an odd number of frames >= 3 (SS/ESS pairs from frames 0 and 1), got {length}.")
+        raise ValueError(f"clip: expected an odd number of frames >= 3 (SS/ESS pairs from 0 and from 1), got {length}.")
     runs = jax.tree.map(lambda leaf: jnp.stack([leaf[:-1], leaf[1:]], axis=1), clip.frames)
     runs = dataclasses.replace(runs, cut=runs.cut.at[0].set(True))
     rollout = unroll(method, variables, runs, alternate(0), train=True, keep=keep)
@@ -57,7 +58,7 @@ def both_kinds(method: Method, variables: PyTree, clip: Sequence, keep: Callable
         return jnp.concatenate([pairs, odd[-1:]])
 
     ordered = {SS: 1, ESS: 0}  # the run that has frame 1 as this kind
-    return {kind: jax.tree.map(lambda leaf, r=run: interleave(leaf, r), rollout.aux[kind]) for kind, run in ordered.items()}
+    return {kind: jax.tree.map(partial(interleave, first=run), rollout.aux[kind]) for kind, run in ordered.items()}
 
 
 def frnet_objective(method: Method, network: Network, *, feature_weight: float = 0.001) -> Objective:
@@ -71,7 +72,7 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
 
     def objective(variables: PyTree, clip: Sequence) -> dict[str, Array]:
         predicted = both_kinds(method, variables, clip, keep=lambda aux: aux.get("extrapolated", {}))[ESS]
-        target = log1p(halve(clip.frames.color[1:-1]))
+        target = log1p(halve(rendered_color(clip.frames, "frnet")[1:-1]))
         features, _ = network.apply(variables["frnet"], target, method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted.features, features, strict=True)]
         return {

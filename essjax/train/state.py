@@ -2,15 +2,14 @@
 
 import math
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
 
-from essjax.typing import Array, PyTree
+from essjax.typing import Array, PyTree, pytree
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@pytree
 class TrainState:
     """Everything that changes: a checkpoint of it (and of the data iterator) continues a run exactly.
 

@@ -67,7 +67,7 @@ def axis_taps(positions: Array, size: int, mode: str, outside: str) -> list[Tap]
 
 def gather_pixels(flat: Array, index: Array) -> Array:
     """Rows ``index`` (any shape, known to be inside) of ``flat`` ``[H * W, C]``: the fast gather."""
-    return flat.at[index].get(mode="promise_in_bounds")
+    return jnp.asarray(flat).at[index].get(mode="promise_in_bounds")
 
 
 def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Array:
@@ -140,8 +140,9 @@ def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Arra
 def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outside: str = "border") -> Image:
     """Read ``image`` at ``positions``.
 
-    Bicubic differentiates in reverse mode only. Weights and sums are float32 whatever the image's type. Finite gradients everywhere; bilinear has a kink at pixel
-    centres (its gradient there is that of the right/lower side), nearest has none with respect to positions.
+    Weights and sums are float32 whatever the image's type. Bicubic differentiates in reverse mode only. Finite
+    gradients everywhere; bilinear has a kink at pixel centres (its gradient there is that of the right/lower side),
+    nearest has none with respect to positions.
 
     Args:
       image: ``[..., H, W, C]``, finite (``mode="nearest"`` also takes infinities and integers unchanged).
