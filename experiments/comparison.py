@@ -4,7 +4,10 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
+
 from essjax.data import Dataset
+from essjax.frames import select_time
 from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.evaluate import Clip, Runner
@@ -31,14 +34,17 @@ def make_runners(
         variant = VARIANTS[row]
         if row == "taa" and not native:
             continue
-        if variant.tuned:
-            if row in kept:
-                settings[row] = kept[row]
-                method = variant.method(config, clamp=kept[row].clamp)
-            else:
+        if variant.tuned and config.tune:
+            if row not in kept:
                 on_step(f"tuning {row}")
-                settings[row], method, _ = tune(variant, config, validation)
-            runners[row] = Runner(method, setting_variables(settings[row]))
+                kept[row] = tune(variant, config, validation)
+            settings[row] = kept[row]
+            method = variant.method(config, clamp=kept[row].clamp)
+            runners[row] = Runner(method, setting_variables(kept[row]))
+        elif variant.tuned:
+            method = variant.method(config)
+            example = select_time(validation[0].sequence.frames, 0)
+            runners[row] = Runner(method, method.init(jax.random.key(0), example))
         elif row in (name, *PARTS.get(name, ())):
             method = variant.method(config)
             entries = [stage.name for stage in variant.stages(config)]

@@ -15,7 +15,7 @@ class Config:
     Training: clip (frames per BPTT window), crop (width, height), frnet_batch, batch, width, frnet_width,
       frnet_learning_rate, learning_rate, the stages' budgets *_steps and *_seconds, save_every,
       the losses' weights of ExtraSS eq 9, 12, 14, vgg (path of VGG-16 weights).
-    Evaluation: warmup (frames not scored at the start and after a cut), pictures (chosen frames per sequence).
+    Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not scored at the start and after a cut), pictures (chosen frames per sequence).
     """
 
     seed: int = 0
@@ -47,6 +47,7 @@ class Config:
     vgg_weight: float = 0.01
     temporal_weight: float = 1.0
     vgg: str | None = None
+    tune: bool = True
     warmup: int = 5
     pictures: int = 1
 
@@ -54,7 +55,7 @@ class Config:
 PRESETS: dict[str, Config] = {
     "smoke": Config(
         size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=3, crop=(32, 24),
-        batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None,
+        batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None, tune=False,
     ),
     "quick": Config(),
     "paper": Config(
@@ -100,7 +101,9 @@ def _parse(key: str, text: str, kind: Any) -> Any:
     optional = "None" in str(kind)
     if value is None and optional:
         return None
-    if kind is int or str(kind).startswith("int"):
+    if kind is bool or str(kind) == "bool":
+        fits = isinstance(value, bool)
+    elif kind is int or str(kind).startswith("int"):
         fits = isinstance(value, int) and not isinstance(value, bool)
     elif kind is float or str(kind).startswith("float"):
         fits = isinstance(value, int | float) and not isinstance(value, bool)

@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -171,19 +173,31 @@ def evaluate(
     """
     curves: dict[str, dict[str, list]] = {name: {} for name in runners}
     shown: dict[tuple, dict] = {}
-    for clip in clips:
-        chosen = picture_frames(clip, pictures)
-        for name, runner in runners.items():
+
+    def run_method(name: str) -> None:
+        runner = runners[name]
+        for clip in clips:
             on_step(f"{name} on {clip.name}")
             curves[name][clip.name] = []
             for schedule in schedules(runner.method):
                 kinds = schedule.kinds(len(clip.numbers))
                 images = runner(clip.sequence, schedule)
-                rows = score_clip(runner.method, clip, images, kinds)
-                curves[name][clip.name] += rows
-                for n in chosen:
-                    _collect_picture(shown, clip, n, name, runner.method, images, kinds)
-    return {"rows": _summarise(curves), "curves": curves, "pictures": _ordered(shown)}
+                curves[name][clip.name] += score_clip(runner.method, clip, images, kinds)
+                for n in picture_frames(clip, pictures):
+                    with lock:
+                        _collect_picture(shown, clip, n, name, runner.method, images, kinds)
+
+    lock = threading.Lock()
+    with ThreadPoolExecutor(2) as pool:  # most of the time is compilation, which two threads do side by side
+        list(pool.map(run_method, runners))
+    return {"rows": _summarise(curves), "curves": curves, "pictures": [_sorted_images(p, runners) for p in _ordered(shown)]}
+
+
+def _sorted_images(picture: dict, names: Iterable[str]) -> dict:
+    """The images in the table's order, whichever thread came first."""
+    order = ["input", *names, "reference"]
+    parts = {part: {name: picture[part][name] for name in order if name in picture[part]} for part in ("images", "previous")}
+    return {**picture, **parts}
 
 
 def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, images: np.ndarray, kinds) -> None:

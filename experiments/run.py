@@ -51,7 +51,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace, console: Console) -> int:
-    # Imported here: a typing error in the command line should not wait for JAX.
+    if options.preset == "smoke":  # nearly all of its minute is compilation: less optimisation halves it
+        os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
+    # Imported here: a typing error in the command line should not wait for JAX, and flags come first.
     from experiments import variants
     from experiments.profile import write_profile
 
@@ -128,9 +130,10 @@ def _experiment(options: argparse.Namespace, config: Config, out: Path, console:
                     bars[stage] = progress.add_task(f"train {stage}", total=1.0, text="")
                 progress.update(bars[stage], completed=fraction, text=f"step {step}, loss {terms['loss']:.4f}")
 
-            run = restore_variant if options.eval_only else train_variant
-            arguments = (variant, dataset, config, out)
-            variables, training = run(*arguments) if options.eval_only else run(*arguments, on_step)
+            if options.eval_only:
+                variables, training = restore_variant(variant, dataset, config, out)
+            else:
+                variables, training = train_variant(variant, dataset, config, out, on_step)
         lap("training")
 
         bar = progress.add_task("evaluate", total=None, text="reading")

@@ -30,15 +30,14 @@ class Setting(NamedTuple):
     psnr: float
 
 
-def tune(variant: Variant, config: Config, clips: list[Clip]) -> tuple[Setting, Method, dict[str, Any]]:
-    """For each clamp the best alpha, then for it the best sigma; returns the best setting, its method and variables."""
-    found: list[tuple[Setting, Method]] = []
+def tune(variant: Variant, config: Config, clips: list[Clip]) -> Setting:
+    """For each clamp the best alpha, then for it the best sigma; returns the best of all."""
+    found = []
     for clamp in CLAMPS:
         method = variant.method(config, clamp=clamp)
         first = _best(method, clamp, [(alpha, FIRST_SIGMA) for alpha in ALPHAS], clips)
-        found.append((_best(method, clamp, [(first.alpha, sigma) for sigma in SIGMAS], clips), method))
-    best, method = max(found, key=lambda pair: pair[0].psnr)
-    return best, method, setting_variables(best)
+        found.append(_best(method, clamp, [(first.alpha, sigma) for sigma in SIGMAS], clips))
+    return max(found, key=lambda setting: setting.psnr)
 
 
 def setting_variables(setting: Setting) -> dict[str, Any]:

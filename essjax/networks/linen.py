@@ -10,17 +10,21 @@ from essjax.interfaces import Network
 from essjax.typing import Array, Key, PyTree
 
 
-def kernel_deviation(key: Key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
-    """The ``kernel_init`` of all our layers: LeCun's standard deviation, constant; ``from_linen`` adds the noise."""
-    fan_in = math.prod(shape[:-1])
-    return jnp.full(shape, fan_in**-0.5, dtype)
+def kernel_bound(key: Key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
+    """The ``kernel_init`` of our layers: the bound of He's uniform distribution; ``from_linen`` multiplies by noise.
+
+    Source: He et al. 2015, eq 10, for ReLU: variance 2 / fan-in.
+    """
+    del key
+    return jnp.full(shape, math.sqrt(6.0 / math.prod(shape[:-1])), dtype)
 
 
 def _multiply_kernels_by_noise(key: Key, variables: PyTree) -> PyTree:
-    """Truncated normal noise for all kernels in one draw: each draw with several axes takes XLA seconds to compile."""
+    """Uniform noise in [-1, 1) for all kernels."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(variables)
     sizes = [leaf.size if path[-1].key == "kernel" else 0 for path, leaf in leaves]
-    noise = jax.random.truncated_normal(key, -2.0, 2.0, (sum(sizes),)) / 0.8796  # standard deviation 1
+    # One draw along one axis: XLA:CPU compiles seconds for each draw of an array with several axes.
+    noise = jax.random.uniform(key, (sum(sizes),), minval=-1.0)
     drawn, start = [], 0
     for (_, leaf), size in zip(leaves, sizes, strict=True):
         drawn.append(leaf * noise[start : start + size].reshape(leaf.shape) if size else leaf)
@@ -29,18 +33,22 @@ def _multiply_kernels_by_noise(key: Key, variables: PyTree) -> PyTree:
 
 
 def from_linen(module: nn.Module) -> Network:
-    """Wrap a linen module whose ``__call__`` takes ``(*inputs, train)`` and whose kernels start as ``kernel_deviation``.
+    """Wrap a linen module whose ``__call__`` takes ``(*inputs, train)`` and whose kernels start as ``kernel_bound``.
 
     Returns:
-      ``Network(init, apply)``: ``init(key, *inputs) -> variables`` (inputs may be ``jax.ShapeDtypeStruct``); ``apply(variables, *inputs, train=False, method=None)
-      method=None) -> (output, state)``, where ``state`` holds new BatchNorm statistics when ``train`` and is {} otherwise.
+      ``Network(init, apply)``: ``init(key, *inputs) -> variables`` (inputs may be ``jax.ShapeDtypeStruct``);
+      ``apply(variables, *inputs, train=False, method=None) -> (output, state)``, where ``state`` holds new BatchNorm
+      statistics when ``train`` and is {} otherwise.
     """
 
     def init(key, *inputs):
-        # Only shapes are looked at and only parameters computed: a plain init would compile and run a forward pass,
-        # and a jitted one spends most of a minute on XLA:CPU's code for the random numbers of all layers together.
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), inputs)
-        return module.lazy_init(key, *shapes, train=False)
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), inputs)  # no forward pass
+
+        @jax.jit
+        def make(key):
+            return _multiply_kernels_by_noise(key, module.lazy_init(key, *shapes, train=False))
+
+        return make(key)
 
     def apply(variables, *inputs, train: bool = False, method=None):
         if train and "batch_stats" in variables:
