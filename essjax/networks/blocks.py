@@ -1,14 +1,12 @@
 """Pieces that the networks share. All images ``[B, H, W, C]``."""
 
-import math
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from essjax.networks.convolution import scan_friendly_convolution
 from essjax.networks.linen import kernel_bound
-from essjax.typing import Array, Image, Key
+from essjax.typing import Image
 
 
 def pad_to_multiple(image: Image, multiple: int) -> Image:
@@ -39,15 +37,6 @@ def bilinear_upsample(image: Image, factor: int = 2) -> Image:
     """Bilinear upsampling, pixel centres at +0.5, borders replicated."""
     *lead, height, width, channels = image.shape
     return jax.image.resize(image, (*lead, height * factor, width * factor, channels), "linear")
-
-
-def he_uniform(key: Key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
-    """He et al. 2015, uniform. Drawn from a flat array of few possible sizes: XLA:CPU takes a second per new shape."""
-    size, drawn = math.prod(shape), 4096
-    while drawn < size:
-        drawn *= 4
-    flat = jax.random.uniform(key, (drawn,), dtype, -1.0, 1.0)[:size]
-    return flat.reshape(shape) * math.sqrt(6.0 / math.prod(shape[:-1]))
 
 
 def conv(features: int, size: int = 3, **options) -> nn.Conv:
