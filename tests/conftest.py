@@ -3,9 +3,13 @@
 import os
 import tempfile
 
-import hypothesis
-import jax
-import pytest
+# Before JAX starts: the suite spends its time on compiling, and LLVM without optimisation compiles in two thirds of it.
+# XLA's own passes stay on. Set XLA_FLAGS (also to nothing) to test what users run; a test of speed must not rely on it.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 hypothesis.settings.register_profile("default", deadline=None, max_examples=15, print_blob=True)
 hypothesis.settings.register_profile("ci", parent=hypothesis.settings.get_profile("default"), derandomize=True)
@@ -18,6 +22,7 @@ def compilation_cache():
     with tempfile.TemporaryDirectory(prefix="essjax-tests-", ignore_cleanup_errors=True) as folder:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder  # subprocesses
         jax.config.update("jax_compilation_cache_dir", folder)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
         yield
         jax.config.update("jax_compilation_cache_dir", None)
         os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)

@@ -13,7 +13,7 @@ from tests.helpers import make_frames, make_sequence
 
 
 def one_frame(**changes) -> fr.Frame:
-    frame = jax.tree.map(lambda leaf: np.array(leaf[1, 0]), make_frames(0, T=2, B=1, H=5, W=7))
+    frame = jax.tree.map(lambda leaf: np.asarray(leaf)[1, 0], make_frames(0, T=2, B=1, H=5, W=7))
     return dataclasses.replace(frame, **changes)
 
 

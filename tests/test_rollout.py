@@ -1,6 +1,7 @@
 """The rollout against a plain Python loop over the same two steps, on a toy method whose history is easy to follow."""
 
 import dataclasses
+import functools
 import re
 
 import jax
@@ -42,14 +43,22 @@ def toy(latency: int = 0, **info) -> Method:
 
 
 VARIABLES = {"mix": jnp.array(0.25)}
+TOY = toy()
+STEPS = {SS: jax.jit(TOY.render_step), ESS: jax.jit(TOY.extrapolate_step)}
+EVERY, EVEN, ODD = every(), alternate(0), alternate(1)
+at = jax.jit(select_time)  # one program per shape of frames; by slices, each frame and leaf would be one
 
 
-def python_loop(method, variables, frames, kinds):
-    history, images, counts = method.start(select_time(frames, 0)), [], []
+@functools.cache
+def compiled(schedule, method=TOY, **options):
+    return jax.jit(lambda frames: unroll(method, VARIABLES, frames, schedule, **options))
+
+
+def python_loop(frames, kinds):
+    history, images, counts = TOY.start(at(frames, 0)), [], []
     for n, kind in enumerate(kinds):
-        frame = select_time(frames, n)
-        step = method.render_step if kind == SS else method.extrapolate_step
-        history, prediction = step(variables, history, frame if kind == SS else without_color(frame))
+        frame = at(frames, n)
+        history, prediction = STEPS[kind](VARIABLES, history, frame if kind == SS else without_color(frame))
         images.append(prediction.image)
         counts.append(prediction.aux["count"])
     return jnp.stack(images), history, counts
@@ -67,12 +76,12 @@ def test_kinds():
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 6])
-@pytest.mark.parametrize("schedule", [every(), alternate(0), alternate(1)], ids=["every", "even", "odd"])
+@pytest.mark.parametrize("schedule", [EVERY, EVEN, ODD], ids=["every", "even", "odd"])
 def test_unroll_equals_a_python_loop(schedule, length):
     frames = make_frames(length, T=length, H=4, W=5)
     frames = dataclasses.replace(frames, cut=frames.cut.at[min(3, length - 1), 1].set(True))
-    images, history, counts = python_loop(toy(), VARIABLES, frames, schedule.kinds(length))
-    result = jax.jit(lambda f: unroll(toy(), VARIABLES, f, schedule, keep=lambda aux: {"count": aux["count"]}))(frames)
+    images, history, counts = python_loop(frames, schedule.kinds(length))
+    result = compiled(schedule, keep=lambda aux: {"count": aux["count"]})(frames)
     np.testing.assert_allclose(result.image, images, rtol=1e-6, atol=1e-6)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), result.history, history)
     for kind in (SS, ESS):
@@ -86,23 +95,21 @@ def test_options_change_neither_values_nor_gradients():
     frames = make_frames(1, T=6, H=4, W=5)
 
     def value_and_grad(**options):
-        return jax.value_and_grad(
-            lambda variables: jnp.sum(unroll(toy(), variables, frames, alternate(1), **options).image ** 2)
-        )(VARIABLES)
+        loss = lambda variables: jnp.sum(unroll(TOY, variables, frames, ODD, **options).image ** 2)
+        return jax.jit(jax.value_and_grad(loss))(VARIABLES)
 
     value, gradient = value_and_grad()
-    for options in ({"scan_unroll": 2}, {"scan_unroll": 99, "remat": True}):
-        other, other_gradient = value_and_grad(**options)
-        np.testing.assert_allclose(other, value, rtol=1e-5)
-        np.testing.assert_allclose(other_gradient["mix"], gradient["mix"], rtol=1e-4)
+    other, other_gradient = value_and_grad(remat=True)
+    np.testing.assert_allclose(other, value, rtol=1e-5)
+    np.testing.assert_allclose(other_gradient["mix"], gradient["mix"], rtol=1e-4)
 
 
 def test_cut_resets_history():
     frames = make_frames(5, T=6, B=2, H=4, W=5)
     frames = dataclasses.replace(frames, cut=frames.cut.at[4, 0].set(True))
-    image = unroll(toy(), VARIABLES, frames, alternate(0)).image
+    image = compiled(EVEN)(frames).image
     other = dataclasses.replace(frames, color=frames.color.at[:4].multiply(3.0))  # only what lies before the cut
-    changed = unroll(toy(), VARIABLES, other, alternate(0)).image
+    changed = compiled(EVEN)(other).image
     np.testing.assert_array_equal(image[4:, 0], changed[4:, 0])
     assert float(jnp.abs(image[4:, 1] - changed[4:, 1]).min(axis=(1, 2, 3)).max()) > 0.0  # the other element has no cut
 
@@ -110,23 +117,21 @@ def test_cut_resets_history():
 def test_extrapolated_colour_is_never_read():
     frames = make_frames(2, T=6, H=4, W=5)
     poisoned = dataclasses.replace(frames, color=frames.color.at[jnp.array([2, 4])].set(jnp.nan))
-    np.testing.assert_array_equal(
-        unroll(toy(), VARIABLES, poisoned, alternate(1)).image, unroll(toy(), VARIABLES, frames, alternate(1)).image
-    )
+    np.testing.assert_array_equal(compiled(ODD)(poisoned).image, compiled(ODD)(frames).image)
 
 
 def test_causal():
     frames = make_frames(3, T=6, H=4, W=5)
     later = dataclasses.replace(frames, color=frames.color.at[4:].add(1.0), motion=frames.motion.at[4:].add(1.0))
-    a, b = (unroll(toy(), VARIABLES, f, alternate(0)).image for f in (frames, later))
+    a, b = (compiled(EVEN)(f).image for f in (frames, later))
     np.testing.assert_array_equal(a[:4], b[:4])
     assert float(jnp.abs(a[4:] - b[4:]).max()) > 0.1
 
 
 def test_latency_is_shifted_away():
     frames = make_frames(4, T=5, H=4, W=5)
-    prompt = unroll(toy(), VARIABLES, frames, every()).image
-    late = unroll(toy(latency=1), VARIABLES, frames, every()).image  # toy(latency=1) claims step n shows frame n - 1
+    prompt = compiled(EVERY)(frames).image
+    late = compiled(EVERY, toy(latency=1))(frames).image  # toy(latency=1) claims step n shows frame n - 1
     np.testing.assert_array_equal(late[:-1], prompt[1:])
     np.testing.assert_array_equal(late[-1], prompt[-1])
 
@@ -134,31 +139,30 @@ def test_latency_is_shifted_away():
 def test_train_flag_reaches_the_steps():
     frames = make_frames(4, T=3, H=4, W=5)
     keep = lambda aux: aux.get("train", jnp.array(False))
-    assert bool(unroll(toy(), VARIABLES, frames, every(), train=True, keep=keep).aux[SS].all())
-    assert not bool(unroll(toy(), VARIABLES, frames, every(), keep=keep).aux[SS].any())
+    assert bool(compiled(EVERY, train=True, keep=keep)(frames).aux[SS].all())
+    assert not bool(compiled(EVERY, keep=keep)(frames).aux[SS].any())
 
 
 def test_unsupported_frames_and_schedules():
     frames = make_frames(0, T=4, H=4, W=5)
     message = "toy cannot extrapolate: it needs the colour of every frame. Use schedule every()"
     with pytest.raises(ValueError, match=re.escape(message)):
-        unroll(toy(renders_all=True), VARIABLES, frames, alternate(0))
-    unroll(toy(renders_all=True), VARIABLES, frames, every())
+        unroll(toy(renders_all=True), VARIABLES, frames, EVEN)
+    jax.eval_shape(lambda f: unroll(toy(renders_all=True), VARIABLES, f, EVERY), frames)
     with pytest.raises(ValueError, match=re.escape(message)):
         refuse_extrapolation("toy")({}, {}, frames)
     poor = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, roughness=None))
     with pytest.raises(ValueError, match="toy needs the buffers roughness, which these frames do not have"):
-        check_supported(toy(requires=frozenset({"roughness"})), poor, every())
+        check_supported(toy(requires=frozenset({"roughness"})), poor, EVERY)
     with pytest.raises(ValueError, match="toy needs the buffers color"):
-        check_supported(toy(), without_color(frames), every())
+        check_supported(toy(), without_color(frames), EVERY)
 
 
 def test_streaming_equals_the_rollout():
     frames = make_frames(6, T=5, H=4, W=5)
-    kinds = alternate(0).kinds(5)
-    steps = {kind: stream_step(toy(), kind) for kind in (SS, ESS)}
-    history, images = toy().start(select_time(frames, 0)), []
-    for n, kind in enumerate(kinds):
-        history, image = steps[kind](VARIABLES, history, select_time(frames, n))
+    steps = {kind: stream_step(TOY, kind) for kind in (SS, ESS)}
+    history, images = TOY.start(at(frames, 0)), []
+    for n, kind in enumerate(EVEN.kinds(5)):
+        history, image = steps[kind](VARIABLES, history, at(frames, n))
         images.append(image)
-    np.testing.assert_allclose(jnp.stack(images), unroll(toy(), VARIABLES, frames, alternate(0)).image, rtol=1e-6)
+    np.testing.assert_allclose(jnp.stack(images), compiled(EVEN)(frames).image, rtol=1e-6)

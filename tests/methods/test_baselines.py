@@ -180,16 +180,15 @@ def test_jau_reads_sample_positions():
 def test_warp_follows_integer_motion_and_jitter():
     """With equal jitter an integer shift is exact; two extrapolated frames in a row both read the rendered one."""
     frames, _ = moving_texture(5, velocity=(2.0, -1.0), jitter=False)
-    method = methods.warp()
-    history = method.start(select_time(frames, 0))
-    history, shown = method.render_step({}, history, select_time(frames, 0))
+    render, extrapolate = jax.jit(WARP.render_step), jax.jit(WARP.extrapolate_step)
+    history, shown = render({}, WARP.start(select_time(frames, 0)), select_time(frames, 0))
     np.testing.assert_array_equal(shown.image, frames.color[0])
     for t in (1, 2):
-        history, prediction = method.extrapolate_step({}, history, without_color(select_time(frames, t)))
+        history, prediction = extrapolate({}, history, without_color(select_time(frames, t)))
         expected = frames.color[t]
         np.testing.assert_allclose(prediction.image[: -t - 1, 2 * t :], expected[: -t - 1, 2 * t :], atol=1e-5)
-    history, _ = method.render_step({}, history, select_time(frames, 3))  # two in a row: the latest counts
-    history, _ = method.render_step({}, history, select_time(frames, 4))
+    history, _ = render({}, history, select_time(frames, 3))  # two in a row: the latest counts
+    history, _ = render({}, history, select_time(frames, 4))
     np.testing.assert_array_equal(history["color"], frames.color[4])
     np.testing.assert_array_equal(history["motion"], 0.0)
 
@@ -226,13 +225,18 @@ def test_warp_blur():
         methods.warp(blur=-1)
 
 
+@functools.partial(jax.jit, static_argnums=3)
+def resample(color, jitter, sigma, scale):
+    return methods.gaussian_resample(color, color, jitter, sigma, scale)
+
+
 @pytest.mark.parametrize("scale", [1, 2, 4])
 @settings(max_examples=5)
 @given(seed=st.integers(0, 2**16))
 def test_gaussian_resample_against_brute_force(scale, seed):
     H, W, sigma = 3, 4, 0.7
     color, jitter = random_image(seed, H, W, 2), random_image(seed, 2, low=-0.5, high=0.5)
-    got = jax.jit(lambda c, j: methods.gaussian_resample(c, c, j, jnp.float32(sigma), scale))(color, jitter)
+    got = resample(color, jitter, jnp.float32(sigma), scale)
     j = np.asarray(jitter)
     for y in range(H * scale):
         for x in range(W * scale):

@@ -178,32 +178,33 @@ def test_works_in_a_scan_and_under_vmap_with_a_traced_sigma():
     first = warp(radiance, guide_previous, guide, motion, sigma_guide=0.1)
     np.testing.assert_allclose(scanned[0], first, atol=1e-5)
     np.testing.assert_allclose(scanned[1], warp(first, guide_previous, guide, motion, sigma_guide=0.3), atol=1e-5)
-    mapped = jax.vmap(lambda s: gbuffer_guided_warp(radiance, guide_previous, guide, motion, sigma_guide=s))
+    mapped = jax.jit(jax.vmap(lambda s: gbuffer_guided_warp(radiance, guide_previous, guide, motion, sigma_guide=s)))
     np.testing.assert_allclose(mapped(jnp.array([0.1, 0.3]))[0], first, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def gradients():
+    """Value and gradients of a weighted sum of the image, in one program."""
+
     def loss(radiance, guide_previous, guide, motion, sigma_guide, sigma_distance):
         image = gbuffer_guided_warp(
             radiance, guide_previous, guide, motion, sigma_guide=sigma_guide, sigma_distance=sigma_distance
         )
         return jnp.sum(image * jnp.linspace(-1, 1, image.size).reshape(image.shape))
 
-    return jax.jit(loss), jax.jit(jax.grad(loss, tuple(range(6))))
+    return jax.jit(jax.value_and_grad(loss, tuple(range(6))))
 
 
 def test_gradients_match_finite_differences(gradients):
     """On a 2x2 image all four pixels are always the winners, so no step crosses a jump of the selection."""
-    loss, gradient = gradients
     arguments = [*scene(8, 0.3, 2, 2), np.float32(SIGMAS * 8), np.float32(1.5)]
-    slopes = gradient(*arguments)
+    slopes = gradients(*arguments)[1]
     probes = {0: (1, 0, 1), 1: (0, 1, 2), 2: (1, 1, 3), 3: (0, 1, 0), 4: (1,), 5: ()}
     for position, index in probes.items():
         step = np.zeros_like(arguments[position])
         step[index] = 2e-3
         shifted = [[a + sign * step if i == position else a for i, a in enumerate(arguments)] for sign in (1, -1)]
-        slope = float(loss(*shifted[0]) - loss(*shifted[1])) / 4e-3
+        slope = float(gradients(*shifted[0])[0] - gradients(*shifted[1])[0]) / 4e-3
         assert float(np.asarray(slopes[position])[index]) == pytest.approx(slope, rel=0.05, abs=6e-3)
         assert np.abs(slopes[position]).max() > 0
 
@@ -214,7 +215,7 @@ def test_gradients_are_finite_at_singular_points(gradients, motion, same_guides)
     radiance, guide_previous, guide, _ = scene(9)
     guide = guide_previous if same_guides else guide + 1000  # all Gaussians underflow
     field = np.full((H, W, 2), motion, np.float32)
-    for slope in gradients[1](radiance, guide_previous, guide, field, np.float32(SIGMAS), np.float32(1e-2)):
+    for slope in gradients(radiance, guide_previous, guide, field, np.float32(SIGMAS), np.float32(1e-2))[1]:
         assert np.isfinite(slope).all()
 
 

@@ -13,6 +13,10 @@ from essjax.warp import backward_warp, compose_motion, dilate_motion, jittered_m
 H, W = 9, 12
 FEW = settings(max_examples=10, deadline=None)
 seeds = st.integers(0, 2**31 - 1)
+compose = jax.jit(compose_motion)
+dilate = jax.jit(dilate_motion, static_argnames="radius")
+read = jax.jit(sample, static_argnames="mode")
+upsample = jax.jit(upsample_motion, static_argnums=1, static_argnames="mode")
 
 
 def affine(positions, a, b):
@@ -45,7 +49,7 @@ def test_composition_follows_the_path(seed):
     p, q = rng.normal(0, 0.5, (2, 2))
     grid = np.asarray(pixel_positions(H, W), np.float64)
     first, second = affine(grid, a, p) - grid, affine(grid, b, q) - grid
-    total, valid = jax.jit(compose_motion)(first.astype(np.float32), second.astype(np.float32))
+    total, valid = compose(first.astype(np.float32), second.astype(np.float32))
     expected = affine(affine(grid, a, p), b, q) - grid
     middle = affine(grid, a, p)
     interpolated = np.all((middle >= 0.5) & (middle <= [W - 0.5, H - 0.5]), -1)  # no border repeats there
@@ -61,7 +65,7 @@ def test_composition_with_jitter_moves_the_lookup_only():
     first = np.broadcast_to(np.float32([1, 0]), (H, W, 2))
     flow = lambda p: np.stack([0.5 * p[..., 1], 0.25 * p[..., 0]], -1)  # of the world point that is at p in t-1
     second = flow(grid + jitter_previous).astype(np.float32)  # stored at jittered sample positions
-    total, _ = compose_motion(first, second, jitter=jitter, jitter_previous=jitter_previous)
+    total, _ = compose(first, second, jitter=jitter, jitter_previous=jitter_previous)
     expected = first + flow(grid + jitter + first)
     np.testing.assert_allclose(total[2:-2, 2:-2], expected[2:-2, 2:-2], atol=1e-5)
 
@@ -70,7 +74,7 @@ def test_composition_carries_validity_along_the_path():
     motion = np.broadcast_to(np.float32([2, 0]), (H, W, 2))
     valid_previous = np.ones((H, W, 1), np.float32)
     valid_previous[4, 7] = 0
-    _, valid = compose_motion(motion, motion, valid_previous=valid_previous)
+    _, valid = compose(motion, motion, valid_previous=valid_previous)
     expected = np.ones((H, W))
     expected[:, W - 4 :] = 0  # two steps of 2 leave the image (pixel centre + 4 > W)
     expected[4, 5] = 0  # read at + (2, 0)
@@ -89,7 +93,7 @@ def test_upsampled_motion_is_the_same_world_motion(scale):
     jitter = np.float32([0.4, -0.3])
     world = lambda p: np.stack([0.1 * p[..., 0] - 0.2 * p[..., 1] + 1, 0.3 * p[..., 1] + 0.05 * p[..., 0]], -1)
     low = world(np.asarray(pixel_positions(H, W)) + jitter).astype(np.float32)
-    high = jax.jit(upsample_motion, static_argnums=1)(low, scale, jitter=jitter)
+    high = upsample(low, scale, jitter=jitter)
     height, width = round(H * scale), round(W * scale)
     expected = scale * world(np.asarray(pixel_positions(height, width)) / scale)
     assert high.shape == (height, width, 2)
@@ -102,14 +106,14 @@ def test_upsampling_equals_sampling_at_the_positions(mode):
     motion = np.random.default_rng(0).normal(size=(2, H, W, 2)).astype(np.float32)
     jitter = np.float32([[0.31, -0.2], [-0.47, 0.13]])
     positions = pixel_positions(2 * H, 2 * W) / 2 - jitter[:, None, None]
-    expected = 2 * sample(motion, positions, mode=mode)
-    np.testing.assert_allclose(upsample_motion(motion, 2, jitter=jitter, mode=mode), expected, atol=1e-5)
+    expected = 2 * read(motion, positions, mode=mode)
+    np.testing.assert_allclose(upsample(motion, 2, jitter=jitter, mode=mode), expected, atol=1e-5)
 
 
 def test_nearest_upsampling_repeats_motion():
     motion = np.random.default_rng(1).normal(size=(H, W, 2)).astype(np.float32)
     expected = 2 * np.repeat(np.repeat(motion, 2, 0), 2, 1)
-    np.testing.assert_allclose(upsample_motion(motion, 2, mode="nearest"), expected)
+    np.testing.assert_allclose(upsample(motion, 2, mode="nearest"), expected)
 
 
 def brute_dilation(motion, depth, radius):
@@ -131,15 +135,15 @@ def test_dilation_matches_brute_force_with_ties_and_background(radius, seed):
     rng = np.random.default_rng(seed)
     motion = rng.normal(size=(H, W, 2)).astype(np.float32)
     depth = rng.choice(np.float32([1, 2, 3, np.inf]), (H, W, 1))
-    got = jax.jit(dilate_motion, static_argnames="radius")(motion, depth, radius=radius)
+    got = dilate(motion, depth, radius=radius)
     np.testing.assert_array_equal(got, brute_dilation(motion, depth, radius))
 
 
 def test_dilation_keeps_the_batch_apart():
     rng = np.random.default_rng(0)
     motion, depth = rng.normal(size=(2, 3, H, W, 2)), rng.uniform(1, 2, (2, 3, H, W, 1))
-    got = dilate_motion(motion, depth)
-    np.testing.assert_array_equal(got[1, 2], dilate_motion(motion[1, 2], depth[1, 2]))
+    got = dilate(motion, depth)
+    np.testing.assert_array_equal(got[1, 2], dilate(motion[1, 2], depth[1, 2]))
 
 
 def test_dilation_errors():

@@ -15,6 +15,8 @@ from essjax.warp import backward_warp, hole_mask, occlusion_motion
 H, W = 9, 16
 FEW = settings(max_examples=10, deadline=None)
 mask = jax.jit(hole_mask)
+around = jax.jit(occlusion_motion)
+warp = jax.jit(backward_warp)
 
 
 def wall(first, last, *, stencil=1, near=2.0):
@@ -150,12 +152,12 @@ def test_needs_both_jitters():
 def test_occlusion_motion_reads_background_instead_of_the_occluder():
     current, previous, motion, expected = moved_object()
     hole = mask(current, previous, motion)
-    got = np.asarray(jax.jit(occlusion_motion)(motion, current.depth, hole))
+    got = np.asarray(around(motion, current.depth, hole))
     np.testing.assert_array_equal(got[expected > 0], motion[expected > 0])  # unchanged outside holes
     np.testing.assert_array_equal(got[expected == 0], np.broadcast_to([-3, 0], (15, 2)))  # the occluder's motion
-    color = np.asarray(backward_warp(previous.base_color, got))
+    color = np.asarray(warp(previous.base_color, got))
     assert (color[expected == 0] == np.float32(0.2)).all()  # wall, where plain motion shows the object:
-    assert (np.asarray(backward_warp(previous.base_color, motion))[expected == 0] == np.float32(0.8)).any()
+    assert (np.asarray(warp(previous.base_color, motion))[expected == 0] == np.float32(0.8)).any()
 
 
 def test_occlusion_motion_fills_the_cracks_of_a_magnified_occluder():
@@ -166,13 +168,13 @@ def test_occlusion_motion_fills_the_cracks_of_a_magnified_occluder():
     motion[2:7, 10:13, 0] = np.float32([-8, -7, -6])  # columns 10, 11, 12 come from 2, 4, 6: 3 and 5 are cracks
     hole = np.ones((H, W, 1), np.float32)
     hole[2:7, 2:7] = 0
-    got = np.asarray(occlusion_motion(motion, depth, hole))
+    got = np.asarray(around(motion, depth, hole))
     assert (got[2:7, 2:7, 0] <= -6).all() and (got[hole[..., 0] == 1] == motion[hole[..., 0] == 1]).all()
 
 
 def test_occlusion_motion_stays_where_nothing_landed():
     motion = np.full((H, W, 2), (0.0, 3.0), np.float32)  # the upper rows of t-1 receive nothing
-    got = occlusion_motion(motion, np.ones((H, W, 1), np.float32), np.zeros((H, W, 1), np.float32))
+    got = around(motion, np.ones((H, W, 1), np.float32), np.zeros((H, W, 1), np.float32))
     np.testing.assert_array_equal(got, motion)
 
 

@@ -58,7 +58,7 @@ def test_splat_gradients_are_finite_and_those_of_a_gather():
     rng = np.random.default_rng(1)
     image, weight = rng.normal(size=(2, H, W, 1)).astype(np.float32)
     motion = rng.normal(size=(H, W, 2)).astype(np.float32)
-    to_image, to_motion = jax.grad(lambda i, m: jnp.sum(splat(i, m) * weight), (0, 1))(image, motion)
+    to_image, to_motion = jax.jit(jax.grad(lambda i, m: jnp.sum(splat(i, m) * weight), (0, 1)))(image, motion)
     np.testing.assert_allclose(to_image, gather(weight, motion), atol=1e-5)
     assert np.isfinite(to_motion).all()
 

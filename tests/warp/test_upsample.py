@@ -13,6 +13,10 @@ from essjax.warp import depth_to_space, jitter_aligned_upsample, sample_distance
 H, W = 5, 8
 FEW = settings(max_examples=15, deadline=None)
 in_pixel = st.floats(-0.5, 0.49)
+zeros = jax.jit(zero_upsample, static_argnums=1)
+fold = jax.jit(space_to_depth, static_argnums=1)
+unfold = jax.jit(depth_to_space, static_argnums=1)
+jau = jax.jit(jitter_aligned_upsample, static_argnums=1, static_argnames="mode")
 
 
 def image_of(seed, *leading):
@@ -24,7 +28,7 @@ def image_of(seed, *leading):
 @given(x=in_pixel, y=in_pixel)
 def test_zero_upsampling_puts_each_sample_where_it_fell(scale, x, y):
     image = image_of(0)
-    got = jax.jit(zero_upsample, static_argnums=1)(image, scale, np.float32([x, y]))
+    got = zeros(image, scale, np.float32([x, y]))
     expected = np.zeros((H * scale, W * scale, 3), np.float32)
     column, row = (int(np.floor((np.float32(v) + np.float32(0.5)) * scale)) for v in (x, y))
     expected[row::scale, column::scale] = image
@@ -34,15 +38,15 @@ def test_zero_upsampling_puts_each_sample_where_it_fell(scale, x, y):
 def test_zero_upsampling_with_a_jitter_per_batch_element():
     image = image_of(1, 2, 2)
     jitter = np.float32([[[-0.4, 0.3], [0.1, 0.1]], [[0.49, -0.5], [-0.1, 0.2]]])
-    got = np.asarray(zero_upsample(image, 2, jitter))
+    got = np.asarray(zeros(image, 2, jitter))
     for i in range(2):
         for j in range(2):
-            np.testing.assert_array_equal(got[i, j], zero_upsample(image[i, j], 2, jitter[i, j]))
+            np.testing.assert_array_equal(got[i, j], zeros(image[i, j], 2, jitter[i, j]))
     np.testing.assert_array_equal(got[1, 0, 0::2, 1::2], image[1, 0])  # right column, upper row
 
 
 def test_zero_jitter_at_even_scale_lands_right_and_below_the_centre():
-    got = np.asarray(zero_upsample(image_of(2), 2, jnp.zeros(2)))
+    got = np.asarray(zeros(image_of(2), 2, jnp.zeros(2)))
     assert (got[1::2, 1::2] > 0).all() and (got[0::2] == 0).all()
 
 
@@ -54,7 +58,7 @@ def test_jau_shows_a_ramp_where_it_is_whatever_the_jitter(mode, x, y):
     jitter = np.float32([x, y])
     world = lambda p: p @ np.float32([[1.0], [-3.0]])
     low = world(np.asarray(pixel_positions(H + 4, W + 4)) + jitter)
-    high = jax.jit(jitter_aligned_upsample, static_argnums=1, static_argnames="mode")(low, 2, jitter, mode=mode)
+    high = jau(low, 2, jitter, mode=mode)
     expected = world(np.asarray(pixel_positions(2 * H + 8, 2 * W + 8)) / 2)
     np.testing.assert_allclose(high[6:-6, 6:-6], expected[6:-6, 6:-6], atol=1e-4)
 
@@ -62,12 +66,12 @@ def test_jau_shows_a_ramp_where_it_is_whatever_the_jitter(mode, x, y):
 def test_jau_of_a_sample_on_an_hr_centre_is_that_sample():
     image = image_of(3)
     jitter = np.float32([0.25, -0.25])  # the centre of the right upper HR pixel
-    np.testing.assert_allclose(jitter_aligned_upsample(image, 2, jitter)[0::2, 1::2], image, atol=1e-6)
+    np.testing.assert_allclose(jau(image, 2, jitter)[0::2, 1::2], image, atol=1e-6)
 
 
 def test_jau_keeps_constants_and_type():
     image = jnp.full((H, W, 1), 0.3, jnp.bfloat16)
-    high = jitter_aligned_upsample(image, 4, jnp.array([0.2, 0.4]), mode="bicubic-0.75")
+    high = jau(image, 4, jnp.array([0.2, 0.4]), mode="bicubic-0.75")
     assert high.dtype == jnp.bfloat16 and high.shape == (4 * H, 4 * W, 1)
     np.testing.assert_array_equal(high, jnp.full(high.shape, 0.3, jnp.bfloat16))
 
@@ -103,15 +107,15 @@ def test_space_to_depth_channel_order_by_hand():
 @pytest.mark.parametrize("leading", [(), (2,), (3, 2)])
 def test_space_to_depth_and_back(block, leading):
     x = np.random.default_rng(block).normal(size=(*leading, 2 * block, 5 * block, 3)).astype(np.float32)
-    folded = jax.jit(space_to_depth, static_argnums=1)(x, block)
+    folded = fold(x, block)
     assert folded.shape == (*leading, 2, 5, 3 * block**2)
-    np.testing.assert_array_equal(depth_to_space(folded, block), x)
-    np.testing.assert_array_equal(space_to_depth(depth_to_space(folded, block), block), folded)
+    np.testing.assert_array_equal(unfold(folded, block), x)
+    np.testing.assert_array_equal(fold(unfold(folded, block), block), folded)
 
 
 def test_gradients_are_finite_and_complete():
     loss = lambda i, j: jnp.sum(jitter_aligned_upsample(i, 2, j, mode="bicubic"))
-    to_image, to_jitter = jax.grad(loss, (0, 1))(image_of(4), jnp.zeros(2))
+    to_image, to_jitter = jax.jit(jax.grad(loss, (0, 1)))(image_of(4), jnp.zeros(2))
     assert np.isfinite(to_image).all() and np.isfinite(to_jitter).all()
     assert float(to_image.sum()) == pytest.approx(4 * H * W * 3, rel=1e-5)
 
