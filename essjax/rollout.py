@@ -167,6 +167,7 @@ def stream_step(method: Method, kind: str) -> Callable:
 
     def step(variables, history, frame):
         history, prediction = _step(method, variables, history, frame, kind, train=False)
-        return history, prediction.image
+        # Copies: jit would hand out the frame's own buffers (one of them twice, even), and the next call donates them.
+        return jax.tree.map(jnp.copy, history), prediction.image
 
     return jax.jit(step, donate_argnums=1)

@@ -275,8 +275,8 @@ def extrass(
         return History(
             rendered=start_pair(example),
             image=image,
-            gbuffers=example.gbuffers,
-            jitter=example.jitter,
+            gbuffers=jax.tree.map(jnp.copy, example.gbuffers),  # a streaming step donates its history
+            jitter=jnp.copy(example.jitter),
             depth_scale=depth_scale(example.gbuffers),
             empty=jnp.ones(example.cut.shape, bool),
         )

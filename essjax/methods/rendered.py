@@ -66,7 +66,7 @@ def start_pair(example: Frame) -> RenderedPair:
     """A memory of nothing, with the shapes of ``example`` (whose colour may be None)."""
     empty = _remember(dataclasses.replace(example, color=jnp.zeros_like(example.gbuffers.base_color)))
     count = jnp.zeros(example.cut.shape, jnp.int32)
-    return RenderedPair(frames=jax.tree.map(_twice, empty), count=count, jitter=example.jitter)
+    return RenderedPair(frames=jax.tree.map(_twice, empty), count=count, jitter=jnp.copy(example.jitter))
 
 
 def reset_pair(cut: Flag, fresh: RenderedPair, pair: RenderedPair) -> RenderedPair:
