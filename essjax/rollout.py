@@ -162,7 +162,7 @@ def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
     return [n for n, k in enumerate(kinds) if k == kind]
 
 
-def stream_step(method: Method, kind: str) -> Callable:
+def stream_step(method: Method, kind: str, *, compiler_options: dict | None = None) -> Callable:
     """One jitted step for streaming, history donated: ``(variables, history, frame) -> (history, image)``."""
 
     def step(variables, history, frame):
@@ -170,4 +170,4 @@ def stream_step(method: Method, kind: str) -> Callable:
         # Copies: jit would hand out the frame's own buffers (one of them twice, even), and the next call donates them.
         return jax.tree.map(jnp.copy, history), prediction.image
 
-    return jax.jit(step, donate_argnums=1)
+    return jax.jit(step, donate_argnums=1, compiler_options=compiler_options)

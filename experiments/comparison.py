@@ -40,17 +40,17 @@ def make_runners(
                 kept[row] = tune(variant, config, validation)
             settings[row] = kept[row]
             method = variant.method(config, clamp=kept[row].clamp)
-            runners[row] = Runner(method, setting_variables(kept[row]))
+            runners[row] = Runner(method, setting_variables(kept[row]), config.compiler_options)
         elif variant.tuned:
             method = variant.method(config)
             example = select_time(validation[0].sequence.frames, 0)
-            runners[row] = Runner(method, method.init(jax.random.key(0), example))
+            runners[row] = Runner(method, method.init(jax.random.key(0), example), config.compiler_options)
         elif row in (name, *PARTS.get(name, ())):
             method = variant.method(config)
             entries = [stage.name for stage in variant.stages(config)]
-            runners[row] = Runner(method, {entry: variables[entry] for entry in entries})
+            runners[row] = Runner(method, {entry: variables[entry] for entry in entries}, config.compiler_options)
         else:
-            runners[row] = Runner(variant.method(config), {})
+            runners[row] = Runner(variant.method(config), {}, config.compiler_options)
     content = {row: setting._asdict() for row, setting in settings.items()}
     (out / "tuning.json").write_text(json.dumps(content, indent=1) + "\n")
     return runners, settings

@@ -70,9 +70,9 @@ def _estimated_valid(frames: Frame) -> jax.Array:
 class Runner:
     """Steps a method frame by frame, as a stream does: one compilation per kind of frame and frame size."""
 
-    def __init__(self, method: Method, variables: PyTree):
+    def __init__(self, method: Method, variables: PyTree, compiler_options: dict | None = None):
         self.method, self.variables = method, variables
-        self._steps = {kind: stream_step(method, kind) for kind in (SS, ESS)}
+        self._steps = {kind: stream_step(method, kind, compiler_options=compiler_options) for kind in (SS, ESS)}
         self._start = jax.jit(method.start)
 
     def __call__(self, sequence: Sequence, schedule: Schedule) -> np.ndarray:

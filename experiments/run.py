@@ -51,9 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace, console: Console) -> int:
-    if options.preset == "smoke":  # nearly all of its minute is compilation: less optimisation halves it
-        os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
-    # Imported here: a typing error in the command line should not wait for JAX, and flags come first.
+    # Imported here: a typing error in the command line should not wait for JAX.
     from experiments import variants
     from experiments.profile import write_profile
 

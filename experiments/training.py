@@ -60,7 +60,7 @@ def train_variant(
         checkpoints = Checkpoints(out / "checkpoints" / stage.name)
         try:
             state, report[stage.name] = train(
-                make_train_step(stage.objective, transform, stage.name),
+                make_train_step(stage.objective, transform, stage.name, compiler_options=config.compiler_options),
                 state,
                 make_batches(dataset, config, stage),
                 checkpoints,

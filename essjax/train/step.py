@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,11 @@ from essjax.typing import Array, Callable
 
 
 def make_train_step(
-    objective: Objective, transform: optax.GradientTransformation, trained: str
+    objective: Objective,
+    transform: optax.GradientTransformation,
+    trained: str,
+    *,
+    compiler_options: dict[str, Any] | None = None,
 ) -> Callable[[TrainState, Sequence, float], tuple[TrainState, dict[str, Array]]]:
     """``step(state, clip, learning_rate) -> (state, terms)``, jitted, the state donated.
 
@@ -25,9 +30,10 @@ def make_train_step(
       objective: ``(variables, clip) -> terms``.
       transform: the optimiser, without its learning rate.
       trained: the entry of ``variables`` that is differentiated; the others are frozen.
+      compiler_options: for ``jax.jit``.
     """
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, compiler_options=compiler_options)
     def step(state: TrainState, clip: Sequence, learning_rate: float):
         def loss(part):
             terms = objective({**state.variables, trained: part}, clip)
