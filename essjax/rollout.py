@@ -167,7 +167,6 @@ def stream_step(method: Method, kind: str, *, compiler_options: dict | None = No
 
     def step(variables, history, frame):
         history, prediction = _step(method, variables, history, frame, kind, train=False)
-        # Copies: jit would hand out the frame's own buffers (one of them twice, even), and the next call donates them.
-        return jax.tree.map(jnp.copy, history), prediction.image
+        return history, prediction.image
 
     return jax.jit(step, donate_argnums=1, compiler_options=compiler_options)
