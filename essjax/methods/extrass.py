@@ -225,11 +225,11 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
     return jnp.log(share) - jnp.log1p(-share)
 
 
-SAMPLE_SHARE = 0.3
+SAMPLE_SHARE = 0.7
 """Share of a rendered sample that lies on the centre of an HR pixel; less with distance (Gaussian, below)."""
-SAMPLE_SIGMA = 0.6
+SAMPLE_SIGMA = 0.8
 """Its standard deviation, HR pixels."""
-EXTRAPOLATED_SHARE = 0.1
+EXTRAPOLATED_SHARE = 0.4
 """Share of the LR extrapolation on ESS frames, where history is trusted."""
 
 
