@@ -1,0 +1,44 @@
+import pytest
+
+from experiments.config import PRESETS, make_config
+from experiments.variants import VARIANTS, compared, get_variant
+
+
+def test_overrides_are_typed():
+    config = make_config("quick", ["size=[128,72]", "steps=10", "seconds=null", "learning_rate=1e-3", "tune=false", "vgg=w.npz"])
+    assert (config.size, config.steps, config.seconds, config.learning_rate) == ((128, 72), 10, None, 1e-3)
+    assert config.tune is False and config.vgg == "w.npz"
+
+
+@pytest.mark.parametrize(
+    ("preset", "overrides", "message"),
+    [
+        ("fast", [], "unknown preset 'fast'; choose one of smoke, quick, paper"),
+        ("quick", ["widht=3"], "unknown key 'widht'; valid keys are seed, size"),
+        ("quick", ["width"], "expected key=value"),
+        ("quick", ["width=wide"], "width=wide: expected int"),
+        ("quick", ["size=[96]"], r"size=\[96\]: expected \[width,height\]"),
+        ("quick", ["seconds=null"], "steps and seconds are both null"),
+        ("quick", ["test_frames=1"], "at least 2 frames, got 1"),
+    ],
+)
+def test_bad_settings_say_what_is_valid(preset, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(preset, overrides)
+
+
+def test_every_preset_passes_its_own_check():
+    for preset in PRESETS:
+        make_config(preset, [])
+
+
+def test_variants_are_listed_for_an_unknown_name():
+    with pytest.raises(ValueError, match="unknown variant 'extras'; choose one of extrass, extrass-e"):
+        get_variant("extras")
+
+
+def test_a_comparison_ends_with_the_variant_and_names_it_once():
+    for name in VARIANTS:
+        rows = compared(name)
+        assert rows[-1] == name and rows.count(name) == 1 and set(rows) <= set(VARIANTS)
+    assert "extrass-e" in compared("extrass") and "extrass-e" not in compared("extrass-w")

@@ -1,0 +1,91 @@
+"""The run command end to end, small: two methods beside ExtraSS, one family, a handful of steps."""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+
+from experiments import comparison, datasets, run, variants
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished run: its folder and its exit code."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    patch = pytest.MonkeyPatch()
+    patch.setattr(variants, "BASELINES", ("extrass-w", "bilinear"))
+    patch.setattr(datasets, "plan", functools.partial(datasets.plan, families=["carousel"]))
+    overrides = ["test_frames=7", "train_frames=5", "frnet_steps=2", "steps=2", "size=[32,24]", "crop=[24,16]"]
+    code = run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides])
+    yield out, code, overrides
+    patch.undo()
+
+
+def test_metrics_json(finished):
+    out, code, _ = finished
+    assert code == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["schema"] == 1 and metrics["variant"] == "extrass" and metrics["preset"] == "smoke"
+    assert metrics["environment"]["steps"] == {"frnet": 2, "extrassnet": 2}
+    assert {"commit", "device", "versions", "seed"} <= set(metrics["environment"])
+    assert set(metrics["seconds"]) == {"data", "training", "tuning", "evaluation", "report", "total"}
+    means = {(r["method"], r["frames"], r["resolution"]): r for r in metrics["rows"] if r["sequence"] == "mean"}
+    assert set(means) == {
+        ("extrass", "ss", "hr"), ("extrass", "ess", "hr"), ("bilinear", "ss", "hr"),
+        ("extrass-w", "ess", "lr"), ("extrass-e", "ess", "lr"),
+    }  # fmt: skip
+    assert all(np.isfinite(row["psnr"]) and 5 < row["psnr"] < 60 for row in means.values())
+
+
+def test_the_report_shows_every_method(finished):
+    out, _, _ = finished
+    page = (out / "report" / "index.html").read_text()
+    assert all(name in page for name in ("extrass", "extrass-w", "extrass-e", "bilinear"))
+    assert list((out / "report" / "sheets").glob("*.png"))
+
+
+def test_the_log_has_a_line_per_step(finished):
+    out, _, _ = finished
+    lines = [json.loads(line) for line in (out / "train" / "extrassnet.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2] and "l1_ess" in lines[0]
+
+
+def test_a_finished_folder_is_not_overwritten(finished, capsys):
+    out, _, overrides = finished
+    assert run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides]) == 2
+    assert "already holds a run. Continue it with --resume" in capsys.readouterr().out.replace("\n", " ")
+    assert run.main(["--preset", "smoke", "--out", str(out), "--resume", "--set", *overrides, "width=6"]) == 2
+    assert "width was 8, now 6" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_eval_only_gives_the_same_numbers(finished):
+    out, _, overrides = finished
+    before = json.loads((out / "metrics.json").read_text())["rows"]
+    assert run.main(["--preset", "smoke", "--out", str(out), "--eval-only", "--set", *overrides]) == 0
+    assert json.loads((out / "metrics.json").read_text())["rows"] == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--variant", "extras"], "unknown variant 'extras'; choose one of extrass"),
+        (["--preset", "fast"], "unknown preset 'fast'; choose one of smoke"),
+        (["--set", "widht=3"], "unknown key 'widht'; valid keys are seed"),
+        (["--eval-only"], "holds no run"),
+        (["--data", "nowhere"], "nowhere/dataset.json: not found"),
+    ],
+)
+def test_bad_arguments_are_one_line(arguments, message, tmp_path, capsys):
+    assert run.main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_list_names_all_variants(capsys):
+    assert run.main(["--list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in variants.VARIANTS)
+
+
+def test_taa_is_left_out_without_native_frames():
+    assert "native" in comparison.table_references()["taa"]
