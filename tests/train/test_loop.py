@@ -1,0 +1,163 @@
+"""The loop: an interrupted run continues as if nothing had happened, whatever stopped it; budgets; NaN."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from essjax.train import Budget, Interrupted, NonFiniteLoss
+from tests.train import tiny_run
+
+
+def losses(folder):
+    """The log without its clock."""
+    lines = [json.loads(line) for line in (Path(folder) / "log.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """Folder and final state of a run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    state, summary = tiny_run.run(folder)
+    assert summary["steps"] == tiny_run.STEPS == int(state.step)
+    return folder, state
+
+
+def assert_same_run(folder, state, uninterrupted):
+    expected_folder, expected = uninterrupted
+    assert losses(folder) == losses(expected_folder)
+    jax.tree.map(np.testing.assert_array_equal, state, expected)
+
+
+def test_log_and_schedule(uninterrupted):
+    lines = losses(uninterrupted[0])
+    assert [line["step"] for line in lines] == list(range(1, tiny_run.STEPS + 1))
+    assert set(lines[0]) == {"step", "near", "far", "loss", "gradient_norm"}
+    np.testing.assert_allclose([line["near"] + line["far"] for line in lines], [line["loss"] for line in lines])
+    assert lines[-1]["near"] < lines[0]["near"]
+    assert len({line["near"] for line in lines}) == len(lines)  # the clips differ
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signal_stops_after_the_step_and_resumes_exactly(tmp_path, uninterrupted, number):
+    before = signal.getsignal(number)
+
+    def on_step(step, progress, terms):
+        if step == 5:
+            os.kill(os.getpid(), number)
+
+    message = "stopped at step 5; the state is saved. Run the same command with --resume."
+    with pytest.raises(Interrupted, match=re.escape(message)):
+        tiny_run.run(tmp_path, on_step=on_step)
+    assert signal.getsignal(number) is before
+    assert len(losses(tmp_path)) == 5
+    steps = []
+    state, _ = tiny_run.run(tmp_path, on_step=lambda step, progress, terms: steps.append(step))
+    assert steps == list(range(6, tiny_run.STEPS + 1))
+    assert_same_run(tmp_path, state, uninterrupted)
+
+
+def test_signal_in_the_last_step_is_the_end(tmp_path, uninterrupted):
+    def on_step(step, progress, terms):
+        if step == tiny_run.STEPS:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    state, _ = tiny_run.run(tmp_path, on_step=on_step)
+    assert_same_run(tmp_path, state, uninterrupted)
+
+
+def test_kill_9_and_resume(tmp_path, uninterrupted):
+    arguments = [sys.executable, "-m", "tests.train.tiny_run", str(tmp_path), "0.15"]
+    process = subprocess.Popen(arguments, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE)
+    try:
+        deadline = time.monotonic() + 120
+        while not any(path.name in ("3", "4", "5") for path in (tmp_path / "checkpoints").glob("*")):
+            assert process.poll() is None and time.monotonic() < deadline, "it never saved a third step"
+            time.sleep(0.02)
+        time.sleep(float(np.random.default_rng().uniform(0.0, 0.3)))  # in a step, in a save, or between
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == -signal.SIGKILL
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write('{"step": 99, "ne')  # a line that was torn
+    steps = []
+    state, _ = tiny_run.run(tmp_path, on_step=lambda step, progress, terms: steps.append(step))
+    assert 1 < steps[0] <= tiny_run.STEPS  # neither from the start nor from a checkpoint at the end
+    assert_same_run(tmp_path, state, uninterrupted)
+
+
+def test_a_log_without_checkpoint_starts_again(tmp_path, uninterrupted):
+    (tmp_path / "log.jsonl").write_text('{"step": 1}\n{"step": 2}\n')
+    state, _ = tiny_run.run(tmp_path)
+    assert_same_run(tmp_path, state, uninterrupted)
+
+
+def test_finished_stage_is_only_restored(tmp_path, uninterrupted):
+    _, expected = uninterrupted
+    state, summary = tiny_run.run(uninterrupted[0], on_step=lambda *_: pytest.fail("it trained again"))
+    jax.tree.map(np.testing.assert_array_equal, state, expected)
+    assert summary["steps"] == tiny_run.STEPS
+
+
+def test_clock_ends_a_stage(tmp_path):
+    _, summary = tiny_run.run(
+        tmp_path, budget=Budget(None, 0.4), on_step=lambda step, progress, terms: time.sleep(0.05)
+    )
+    assert 1 <= summary["steps"] <= 9 and 0.4 <= summary["seconds"] < 5.0
+
+
+class Poisoned:
+    """The tiny batches, with NaN in the reference of batch ``bad`` (counted from 1)."""
+
+    def __init__(self, bad):
+        self.bad, self.count, self.batches = bad, 0, tiny_run.tiny_batches()
+
+    def __next__(self):
+        self.count += 1
+        batch = next(self.batches)
+        if self.count == self.bad:
+            batch.reference[1, 0, 2, 3, 0] = np.nan
+        return batch
+
+    def get_state(self):
+        return self.batches.get_state()
+
+    def set_state(self, state):
+        self.batches.set_state(state)
+
+
+def test_non_finite_loss_names_the_term_and_saves_the_batch(tmp_path):
+    with pytest.raises(NonFiniteLoss) as caught:
+        tiny_run.run(tmp_path, batches=Poisoned(4), save_every=0.0)
+    path = tmp_path / "non_finite_batch_4.npz"
+    assert str(caught.value).startswith(f"step 4: not finite: far, gradient_norm. The batch is in {path}")
+    assert "Check the data (NaN, negative or huge radiance) or lower the learning rate." in str(caught.value)
+    with np.load(path) as saved:
+        assert np.argwhere(np.isnan(saved["reference"])).tolist() == [[1, 0, 2, 3, 0]]
+        assert saved["frames.color"].shape == (3, 2, 3, 4, 3)
+        assert {"frames.motion", "frames.gbuffers.depth", "frames.jitter", "frames.cut"} <= set(saved.files)
+    assert len(losses(tmp_path)) == 3  # only what was good
+    steps = []
+    tiny_run.run(tmp_path, on_step=lambda step, progress, terms: steps.append(step))
+    assert steps[0] == 4  # the last checkpoint is from before the bad batch
+    assert np.isfinite([line["loss"] for line in losses(tmp_path)]).all()
+
+
+def test_budget():
+    assert Budget(10, None).progress(4, 1e9) == 0.4
+    assert Budget(None, 20.0).progress(1000, 5.0) == 0.25
+    assert Budget(10, 20.0).progress(4, 18.0) == 0.9  # whichever ends first
+    assert Budget(10, 20.0).progress(8, 1.0) == 0.8
+    assert Budget(10, 20.0).progress(30, 1.0) == 1.0
+    with pytest.raises(ValueError, match="budget: expected a limit in steps or in seconds, got neither"):
+        Budget(None, None).progress(1, 1.0)

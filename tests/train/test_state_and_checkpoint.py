@@ -1,0 +1,128 @@
+"""The optimiser's state, the learning rate, and checkpoints that come back whole or say why not."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from essjax.train import Checkpoints, cosine, create_state, make_train_step, optimizer
+from tests.train import tiny_run
+
+
+def state_of(width):
+    variables = {"net": {"kernel": jnp.arange(2.0 * width).reshape(2, width)}, "other": {"b": jnp.ones(3)}}
+    return create_state(variables, "net", optimizer())
+
+
+def test_unknown_entry():
+    with pytest.raises(ValueError, match="trained: expected one of fit, frozen, got 'frnet'"):
+        create_state({"fit": {}, "frozen": {}}, "frnet", optimizer())
+
+
+def test_cosine():
+    rate = lambda progress: cosine(progress, peak=2.0, warmup=0.1, floor=0.05)
+    np.testing.assert_allclose([rate(0.0), rate(0.05), rate(0.1)], [0.1, 1.0, 2.0], rtol=1e-6)  # 5 % at the start
+    np.testing.assert_allclose(rate(0.55), 2.0 * (0.05 + 0.95 * 0.5), rtol=1e-6)
+    np.testing.assert_allclose([rate(1.0), rate(1.5)], 0.1, rtol=1e-6)
+    falling = [rate(p) for p in np.linspace(0.1, 1.0, 20)]
+    assert all(a > b for a, b in zip(falling, falling[1:], strict=False))
+
+
+def test_one_step_equals_adam_by_hand():
+    """NumPy's Adam behind a clip of the norm; the frozen entry stays as it was, to the last bit."""
+    clip = jax.tree.map(jnp.asarray, next(tiny_run.tiny_batches()))
+    state, terms = tiny_run.tiny_step()(tiny_run.initial_state(), clip, 0.25)
+    color = np.mean(clip.frames.color, axis=(0, 1, 2, 3))
+    reference = np.mean(clip.reference, axis=(0, 1, 2, 3))
+    gradient = -2.0 * color - 0.2 * reference
+    norm = np.linalg.norm(gradient)
+    assert norm > 1.0  # so that the clip acts
+    np.testing.assert_allclose(terms["gradient_norm"], norm, rtol=1e-5)
+    np.testing.assert_allclose(terms["near"], np.sum(color**2), rtol=1e-5)
+    np.testing.assert_allclose(terms["loss"], terms["near"] + terms["far"], rtol=1e-6)
+    clipped = gradient / norm
+    expected = -0.25 * clipped / (np.abs(clipped) + 1e-8)  # bias-corrected first step of Adam
+    np.testing.assert_allclose(state.variables["fit"]["w"], expected, rtol=1e-4)
+    np.testing.assert_array_equal(state.variables["frozen"]["b"], 1.0)
+    assert int(state.step) == 1
+
+
+def test_non_finite_step_changes_nothing_but_the_count():
+    clip = jax.tree.map(jnp.asarray, next(tiny_run.tiny_batches()))
+    state, _ = tiny_run.tiny_step()(tiny_run.initial_state(), clip, 0.1)
+    before = jax.tree.map(np.array, state)
+    bad = jax.tree.map(lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, clip)
+    after, terms = tiny_run.tiny_step()(state, bad, 0.1)
+    assert not np.isfinite(terms["loss"])
+    jax.tree.map(
+        np.testing.assert_array_equal, (after.variables, after.optimizer), (before.variables, before.optimizer)
+    )
+    assert int(after.step) == 2
+
+
+def test_the_callers_variables_survive_donation():
+    variables = {"fit": {"w": jnp.zeros(3)}, "frozen": {"b": jnp.ones(())}}
+    clip = next(tiny_run.tiny_batches())
+    tiny_run.tiny_step()(create_state(variables, "fit", optimizer()), clip, 0.1)
+    np.testing.assert_array_equal(variables["fit"]["w"], 0.0)
+    np.testing.assert_array_equal(variables["frozen"]["b"], 1.0)
+
+
+def test_step_refuses_gradients_of_other_trees():
+    step = make_train_step(tiny_run.objective, optax.identity(), "absent")
+    with pytest.raises(KeyError, match="absent"):
+        step(tiny_run.initial_state(), next(tiny_run.tiny_batches()), 0.1)
+
+
+def test_round_trip_and_retention(tmp_path):
+    checkpoints = Checkpoints(tmp_path / "a" / "b")  # made with its parents
+    assert checkpoints.latest() is None
+    state = state_of(3)
+    for step in (1, 2, 5):
+        scaled = jax.tree.map(lambda leaf, s=step: leaf * s, state)
+        checkpoints.save(step, scaled, {"seconds": step / 2, "batches": {"next": step}})
+    checkpoints.save(5, state, {"seconds": 99.0})  # exists: nothing happens
+    checkpoints.close()
+    again = Checkpoints(tmp_path / "a" / "b")
+    assert again.latest() == 5
+    restored, progress = again.restore(state)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, 5 * b), restored, state)
+    assert jax.tree.structure(restored) == jax.tree.structure(state)
+    assert progress == {"seconds": 2.5, "batches": {"next": 5}}
+    again.close()
+    assert sorted(path.name for path in (tmp_path / "a" / "b").glob("[0-9]*")) == ["2", "5"]
+
+
+def test_no_checkpoint(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    message = f"{tmp_path}: expected a checkpoint, found none. Train first, or check --out."
+    with pytest.raises(ValueError, match=re.escape(message)):
+        checkpoints.restore(state_of(3))
+    checkpoints.close()
+
+
+def test_other_shapes_and_other_trees(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(7, state_of(3), {"seconds": 1.0})
+    other = create_state({"net": {"weights": jnp.zeros(3)}}, "net", optimizer())
+    for wrong in (state_of(4), other):
+        with pytest.raises(ValueError, match="checkpoint 7 does not fit this configuration") as caught:
+            checkpoints.restore(wrong)
+        assert str(caught.value).startswith(f"{tmp_path}: ")
+        assert str(caught.value).endswith("Use the settings that it was trained with, or another --out.")
+    checkpoints.close()
+
+
+def test_a_save_that_was_killed_is_cleared_away(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(3, state_of(3), {"seconds": 1.0})
+    checkpoints.close()
+    torn = tmp_path / "4.orbax-checkpoint-tmp-1234"
+    (torn / "state").mkdir(parents=True)
+    (torn / "state" / "half").write_text("written")
+    again = Checkpoints(tmp_path)
+    assert again.latest() == 3 and not torn.exists()
+    again.close()

@@ -1,0 +1,71 @@
+"""A stage that trains in a second: fit one vector to the colours of a clip, from a real loader, with a real loop.
+
+``python -m tests.train.tiny_run FOLDER SECONDS`` runs it slowly in its own process, for tests that kill it.
+"""
+
+import functools
+import os
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from essjax.data import clips
+from essjax.frames import select_time
+from essjax.train import Budget, Checkpoints, cosine, create_state, make_train_step, optimizer, train
+from tests.helpers import make_sequence
+
+STEPS = 12
+
+
+def sequences():
+    """Two sequences in memory, NumPy leaves ``[T, H, W, C]``."""
+    batch = jax.tree.map(np.asarray, make_sequence(0, T=6, B=2, H=4, W=5))
+    batch = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), batch)
+    return [select_time(batch, index) for index in range(2)]
+
+
+def objective(variables, clip):
+    """Two terms, so that a test can tell which of them went wrong; they depend on the clip and so on its order."""
+    color, reference = (jnp.mean(image, axis=(0, 1, 2, 3)) for image in (clip.frames.color, clip.reference))
+    return {
+        "near": jnp.sum((variables["fit"]["w"] - color) ** 2),
+        "far": 0.1 * jnp.sum((variables["fit"]["w"] - reference) ** 2) + variables["frozen"]["b"],
+    }
+
+
+def initial_state():
+    """``fit`` is trained, ``frozen`` is not."""
+    return create_state({"fit": {"w": jnp.zeros(3)}, "frozen": {"b": jnp.ones(())}}, "fit", optimizer())
+
+
+@functools.cache
+def tiny_step():
+    """The jitted step, compiled once per process."""
+    return make_train_step(objective, optimizer(), "fit")
+
+
+def tiny_batches(seed=0):
+    """Clips of three frames, both the crop and the flips at random."""
+    return iter(clips(sequences(), length=3, batch=2, crop=(3, 4), seed=seed, threads=1, prefetch=1))
+
+
+def run(folder, *, budget=None, save_every=1e9, on_step=lambda step, progress, terms: None, batches=None):
+    """Train in ``folder`` from its newest checkpoint, if any."""
+    checkpoints = Checkpoints(Path(folder) / "checkpoints")
+    try:
+        return train(
+            tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
+            budget or Budget(STEPS, None), functools.partial(cosine, peak=0.1), save_every=save_every, on_step=on_step,
+        )  # fmt: skip
+    finally:
+        checkpoints.close()
+
+
+if __name__ == "__main__":
+    pause = float(sys.argv[2])
+    print(os.getpid(), flush=True)
+    run(sys.argv[1], save_every=0.0, on_step=lambda step, progress, terms: time.sleep(pause))
