@@ -19,7 +19,7 @@ class Interrupted(RuntimeError):
 
 
 class NonFiniteLoss(RuntimeError):
-    """A loss or gradient was NaN or infinite; the state before it and the batch are saved."""
+    """A loss or gradient was NaN or infinite; the batch is saved, the last checkpoint is from before it."""
 
 
 class Budget(NamedTuple):
@@ -44,7 +44,7 @@ def train(
     checkpoints: Checkpoints,
     log_path: Path,
     budget: Budget,
-    schedule: Callable[[float], float],
+    schedule: Callable[[int, float], float],
     *,
     save_every: float = 30.0,
     on_step: Callable[[int, float, dict[str, float]], None] = lambda step, progress, terms: None,
@@ -58,7 +58,7 @@ def train(
       checkpoints: where the state is kept.
       log_path: JSON lines, one per step; cut back to the checkpoint's step when a run resumes.
       budget: when to end.
-      schedule: learning rate of progress in [0, 1].
+      schedule: learning rate of step and progress in [0, 1].
       save_every: seconds between checkpoints.
       on_step: called with step, progress and the terms of that step.
 
@@ -76,7 +76,8 @@ def train(
         batches.set_state(saved["batches"])  # type: ignore[attr-defined]
     step, terms = int(state.step), {}
     _truncate(log_path, step)
-    started = last_save = time.monotonic() - seconds
+    last_save = time.monotonic()
+    started = last_save - seconds
     with _SignalFlag() as stop, log_path.open("a") as log:
 
         def save():
@@ -86,7 +87,7 @@ def train(
 
         while budget.progress(step, seconds) < 1.0 and not stop.set:
             batch = next(batches)
-            state, terms = step_function(state, batch, schedule(budget.progress(step, seconds)))
+            state, terms = step_function(state, batch, schedule(step, budget.progress(step, seconds)))
             terms = {name: float(value) for name, value in jax.device_get(terms).items()}
             step, seconds = step + 1, time.monotonic() - started
             if not all(np.isfinite(value) for value in terms.values()):
@@ -103,7 +104,7 @@ def train(
 
 
 def _raise_non_finite(step: int, terms: dict[str, float], batch: Any, folder: Path) -> None:
-    names = [name for name, value in terms.items() if not np.isfinite(value) and name != "loss"]
+    names = [name for name, value in terms.items() if not np.isfinite(value) and name != "loss"] or ["loss"]
     path = folder / f"non_finite_batch_{step}.npz"
     leaves, _ = jax.tree_util.tree_flatten_with_path(batch)
     arrays: dict[str, Any] = {jax.tree_util.keystr(key).strip("."): np.asarray(leaf) for key, leaf in leaves}

@@ -41,9 +41,17 @@ def create_state(variables: PyTree, trained: str, transform: optax.GradientTrans
     return TrainState(variables=variables, optimizer=transform.init(variables[trained]), step=jnp.zeros((), jnp.int32))
 
 
-def cosine(progress: float, *, peak: float, warmup: float = 0.02, floor: float = 0.02) -> float:
-    """Learning rate at ``progress`` in [0, 1]: linear warm-up, then cosine decay from ``peak`` to ``floor * peak``."""
-    if progress < warmup:
-        return peak * max(progress / warmup, 0.05)
-    fraction = min((progress - warmup) / (1.0 - warmup), 1.0)
-    return peak * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * fraction)))
+def cosine(step: int, progress: float, *, peak: float, warmup_steps: int = 20, floor: float = 0.02) -> float:
+    """Learning rate: linear warm-up over the first steps, cosine decay from ``peak`` to ``floor * peak`` over progress.
+
+    The warm-up counts steps because on a clock the first step is mostly compilation.
+
+    Args:
+      step: steps taken.
+      progress: fraction of the budget that is used up, in [0, 1].
+      peak: largest rate.
+      warmup_steps: length of the warm-up.
+      floor: last rate over ``peak``.
+    """
+    warmup = min((step + 1) / warmup_steps, 1.0)
+    return warmup * peak * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0))))

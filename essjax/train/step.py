@@ -40,7 +40,7 @@ def make_train_step(
             return sum(terms.values()), terms
 
         (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(state.variables[trained])
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(total) & jnp.isfinite(norm)
         updates, new_optimizer = transform.update(gradient, state.optimizer, state.variables[trained])
         updates = jax.tree.map(lambda update: -learning_rate * update, updates)
