@@ -52,7 +52,7 @@ def test_what_is_remembered():
 
 
 def follow(motions, first, last):
-    """Integer path from every pixel of frame ``last`` back to frame ``first``: total motion, and whether it stays in."""
+    """Integer path from every pixel of frame ``last`` back to ``first``: total motion, and whether it stays inside."""
     total, inside = np.zeros((H, W, 2), int), np.ones((H, W), bool)
     for y in range(H):
         for x in range(W):

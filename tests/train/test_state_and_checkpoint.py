@@ -23,11 +23,12 @@ def test_unknown_entry():
 
 
 def test_cosine():
-    rate = lambda progress: cosine(progress, peak=2.0, warmup=0.1, floor=0.05)
-    np.testing.assert_allclose([rate(0.0), rate(0.05), rate(0.1)], [0.1, 1.0, 2.0], rtol=1e-6)  # 5 % at the start
-    np.testing.assert_allclose(rate(0.55), 2.0 * (0.05 + 0.95 * 0.5), rtol=1e-6)
-    np.testing.assert_allclose([rate(1.0), rate(1.5)], 0.1, rtol=1e-6)
-    falling = [rate(p) for p in np.linspace(0.1, 1.0, 20)]
+    rate = lambda step, progress: cosine(step, progress, peak=2.0, warmup_steps=10, floor=0.05)
+    np.testing.assert_allclose([rate(0, 0.0), rate(4, 0.0), rate(9, 0.0), rate(99, 0.0)], [0.2, 1.0, 2.0, 2.0])
+    np.testing.assert_allclose(rate(99, 0.5), 2.0 * (0.05 + 0.95 * 0.5), rtol=1e-6)
+    np.testing.assert_allclose(rate(4, 0.5), 0.5 * rate(99, 0.5), rtol=1e-6)  # a warm-up on a clock that runs
+    np.testing.assert_allclose([rate(99, 1.0), rate(99, 1.5)], 0.1, rtol=1e-6)
+    falling = [rate(99, progress) for progress in np.linspace(0.0, 1.0, 20)]
     assert all(a > b for a, b in zip(falling, falling[1:], strict=False))
 
 
