@@ -1,0 +1,173 @@
+"""The objectives on fake methods whose steps say what they were given: order of frames, and every term by NumPy."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from essjax.frames import Prediction
+from essjax.interfaces import Method, MethodInfo, Network, reset_at_cut
+from essjax.losses import census, feature_census
+from essjax.methods.extrass import Warped
+from essjax.rollout import ESS, SS
+from essjax.train import extrass_objective, frnet_objective
+from essjax.train.objective import both_kinds
+from tests.helpers import make_sequence, random_image
+
+T, B, H, W = 5, 2, 14, 18
+
+
+def numbered(T):
+    """A clip whose motion holds the frame's number."""
+    clip = make_sequence(0, T=T, B=B, H=H, W=W)
+    numbers = jnp.arange(T, dtype=jnp.float32)[:, None, None, None, None]
+    motion = jnp.broadcast_to(numbers, clip.frames.motion.shape)
+    return dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, motion=motion))
+
+
+def fake(step_aux):
+    """A method whose history is ``[frame, kind]`` of the step before (-1 after a cut) and whose aux ``step_aux`` makes."""
+
+    def start(example):
+        return jnp.full((*example.cut.shape, 2), -1.0)
+
+    def step(kind):
+        def run(variables, history, frame, *, train=False):
+            assert train and (frame.color is not None) == (kind == 0)
+            history = reset_at_cut(frame.cut, start(frame), history)
+            number = frame.motion[..., 0, 0, 0]
+            aux = step_aux(variables, history, frame, kind)
+            image = jnp.zeros((*frame.motion.shape[:-1], 3))
+            return jnp.stack([number, jnp.full_like(number, kind)], axis=-1), Prediction(image=image, aux=aux)
+
+        return run
+
+    return Method(lambda key, example: {}, start, step(0), step(1), MethodInfo("fake", 1))
+
+
+@pytest.mark.parametrize("length", [3, 7])
+def test_both_kinds_gives_every_inner_frame_once_per_kind_in_order(length):
+    def aux(variables, history, frame, kind):
+        number = frame.motion[..., 0, 0, 0]
+        return {"frame": number, "kind": jnp.full_like(number, kind), "before": history}
+
+    kinds = jax.jit(lambda clip: both_kinds(fake(aux), {}, clip, keep=lambda aux: aux))(numbered(length))
+    assert set(kinds) == {SS, ESS}
+    inner = np.arange(1, length - 1)
+    for name, number in ((SS, 0), (ESS, 1)):
+        kept = kinds[name]
+        assert kept["frame"].shape == (length - 2, B)
+        for b in range(B):
+            np.testing.assert_array_equal(kept["frame"][:, b], inner)
+            np.testing.assert_array_equal(kept["kind"][:, b], number)
+            expected = np.stack([inner - 1, np.full_like(inner, 1 - number)], axis=-1)  # the alternation's history
+            if name == SS:
+                expected[0] = -1  # the second run starts there, without history
+            np.testing.assert_array_equal(kept["before"][:, b], expected)
+
+
+@pytest.mark.parametrize("length", [1, 2, 4])
+def test_even_or_short_clips_are_refused(length):
+    message = f"clip: expected an odd number of frames >= 3 .*, got {length}"
+    with pytest.raises(ValueError, match=message):
+        both_kinds(fake(lambda *_: {}), {}, numbered(length), keep=lambda aux: aux)
+
+
+IMAGES = {kind: random_image(40 + kind, 2 * H, 2 * W, 3) for kind in (0, 1)}
+HISTORIES = {kind: random_image(50 + kind, 2 * H, 2 * W, 3) for kind in (0, 1)}
+VALID = {kind: random_image(60 + kind, 2 * H, 2 * W, 1, high=1.0) < 0.7 for kind in (0, 1)}
+FEATURES = {kind: [random_image(70 + 2 * kind + level, 4, 5, 3) for level in (0, 1)] for kind in (0, 1)}
+
+
+def with_frame(pattern, frame):
+    """The same pattern for both elements, made brighter with the frame's number."""
+    return pattern * (1.0 + 0.1 * frame.motion[..., :1, :1, :1])
+
+
+def extrass_aux(variables, history, frame, kind):
+    valid = jnp.broadcast_to(VALID[kind].astype(jnp.float32), (*frame.cut.shape, 2 * H, 2 * W, 1))
+    warped = Warped(log_image=with_frame(HISTORIES[kind], frame), valid=valid, valid_low=valid)
+    features = [with_frame(level, frame) for level in FEATURES[kind]]
+    return {"log_image": with_frame(IMAGES[kind], frame), "warped": warped, "features": features}
+
+
+def weighted(values, mask):
+    mask = np.broadcast_to(mask, values.shape)
+    return np.sum(values * mask) / np.sum(mask)
+
+
+@pytest.mark.parametrize("exact_masks", [True, False])
+def test_extrass_terms_equal_numpy(exact_masks):
+    clip = numbered(T)
+    clip = clip if exact_masks else dataclasses.replace(clip, valid=None)
+    vgg = lambda image: [image[..., ::2, ::2, :], 3.0 * image[..., :1]]
+    objective = extrass_objective(
+        fake(extrass_aux), occlusion_weight=2.0, vgg_weight=0.5, temporal_weight=3.0, vgg_features=vgg
+    )
+    terms = jax.jit(objective)({}, clip)
+
+    brightness = np.repeat(1.0 + 0.1 * np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
+    target = np.log1p(np.asarray(clip.reference[1:-1]))
+    expected = {"features": 0.0}
+    for kind, name in ((0, SS), (1, ESS)):
+        image, history = (np.asarray(pattern[kind]) * brightness for pattern in (IMAGES, HISTORIES))
+        own = np.broadcast_to(np.asarray(VALID[kind], np.float64), (T - 2, B, 2 * H, 2 * W, 1))
+        valid = np.repeat(np.repeat(clip.valid[1:-1], 2, axis=2), 2, axis=3) if exact_masks else own
+        expected[f"l1_{name}"] = np.abs(image - target).mean()
+        expected[f"occlusion_{name}"] = 2.0 * weighted(np.abs(image - target), 1.0 - valid)
+        expected[f"temporal_{name}"] = 3.0 * weighted(np.abs(image - history), own)
+        difference = np.expm1(image) - np.expm1(target)
+        levels = difference[..., ::2, ::2, :], 3.0 * difference[..., :1]
+        expected[f"vgg_{name}"] = 0.5 * sum((level**2).mean() for level in levels)
+    for a, b in zip(FEATURES[0], FEATURES[1], strict=True):
+        expected["features"] += 3.0 * (np.abs(a - b) * brightness).mean()
+    assert set(terms) == set(expected)
+    for name, value in expected.items():
+        np.testing.assert_allclose(terms[name], value, rtol=1e-4, err_msg=name)
+
+
+def test_without_vgg_there_is_no_such_term():
+    terms = jax.eval_shape(extrass_objective(fake(extrass_aux)), {}, numbered(3))
+    assert not any(name.startswith("vgg") for name in terms)
+
+
+@dataclasses.dataclass
+class Half:
+    """What ``frnet_objective`` reads of an ``Extrapolated``."""
+
+    half: jax.Array
+    features: list
+
+
+jax.tree_util.register_dataclass(Half, data_fields=["half", "features"], meta_fields=[])
+HALF = random_image(80, H // 2, W // 2, 3)
+LEVELS = [random_image(81 + level, H // 2, W // 2, 2) for level in (0, 1)]
+
+
+def test_frnet_terms_equal_numpy():
+    def aux(variables, history, frame, kind):
+        if kind == 0:
+            return {}
+        return {"extrapolated": Half(with_frame(HALF, frame), [with_frame(level, frame) for level in LEVELS])}
+
+    def encode(variables, image, method=None):
+        assert method == "encode"
+        return [variables * image[..., :2], image[..., 1:] ** 2], {}
+
+    clip = numbered(T)
+    objective = frnet_objective(fake(aux), Network(None, encode), feature_weight=0.5)
+    terms = jax.jit(objective)({"frnet": jnp.float32(2.0)}, clip)
+
+    brightness = np.repeat(1.0 + 0.1 * np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
+    color = np.asarray(clip.frames.color[1:-1]).reshape(T - 2, B, H // 2, 2, W // 2, 2, 3)
+    target = np.log1p(color.mean(axis=(3, 5)))
+    half = np.asarray(HALF) * brightness
+    np.testing.assert_allclose(terms["charbonnier"], np.sqrt((half - target) ** 2 + 1e-6).mean(), rtol=1e-4)
+    np.testing.assert_allclose(terms["census"], np.mean(census(half, target)), rtol=1e-3)  # has its own oracle
+    predicted = [np.asarray(level) * brightness for level in LEVELS]
+    truth = [2.0 * target[..., :2], target[..., 1:] ** 2]
+    distance = sum(np.mean(feature_census(a, b)) for a, b in zip(predicted, truth, strict=True))
+    np.testing.assert_allclose(terms["feature_census"], 0.5 * distance, rtol=1e-3)
+    assert set(terms) == {"charbonnier", "census", "feature_census"}
