@@ -74,14 +74,13 @@ def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], con
     scored = sum(len(clip.scored) for clip in clips)
     remarks = [
         f"{scored} frames of {len(clips)} sequences are scored, each as SS and as ESS; {config.warmup} frames at the start "
-        f"and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR and SSIM after x/(1+x) and sRGB. "
-        "HR results score against the anti-aliased reference, LR results against that frame's own jittered, aliased colour.",
+        f"and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR and SSIM after x/(1+x) and "
+        "sRGB. HR results score against the anti-aliased reference, LR results against that frame's own jittered, "
+        "aliased colour."
     ]
     for row, setting in settings.items():
-        remarks.append(
-            f"{row}: alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}, the best on the validation "
-            f"frames ({setting.psnr:.2f} dB there)."
-        )
+        chosen = f"alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}"
+        remarks.append(f"{row}: {chosen}, the best on the validation frames ({setting.psnr:.2f} dB there).")
     if clips[0].sequence.native is None:
         remarks.append("No taa row: this dataset has no colour at native resolution.")
     if not clips[0].exact_holes:
@@ -92,5 +91,6 @@ def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], con
 def _foreground_note() -> str:
     return (
         "psnr_foreground leaves the background out; psnr_reference scores LR results against the reference read at the "
-        "sample positions (foreground): a noisy frame as target rewards denoising, that one does not. Both are in metrics.json."
+        "sample positions (foreground): a noisy frame as target rewards denoising, that one does not. Both are in "
+        "metrics.json."
     )

@@ -15,7 +15,8 @@ class Config:
     Training: clip (frames per BPTT window), crop (width, height), frnet_batch, batch, width, frnet_width,
       frnet_learning_rate, learning_rate, the stages' budgets *_steps and *_seconds, save_every,
       the losses' weights of ExtraSS eq 9, 12, 14, vgg (path of VGG-16 weights).
-    Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not scored at the start and after a cut), pictures (chosen frames per sequence).
+    Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
+      scored at the start and after a cut), pictures (chosen frames per sequence).
     optimize: false compiles in half the time for slower code.
     """
 
@@ -62,8 +63,8 @@ class Config:
 PRESETS: dict[str, Config] = {
     "smoke": Config(
         size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=3, crop=(32, 24),
-        batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None, tune=False,
-        optimize=False,
+        batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None,
+        tune=False, optimize=False,
     ),
     "quick": Config(),
     "paper": Config(

@@ -14,11 +14,11 @@ import numpy as np
 from essjax.cameras import pixel_positions
 from essjax.color import display
 from essjax.data import Dataset, Segment, read_segment
-from essjax.frames import Frame, Sequence, background, select_time, without_color
+from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
 from essjax.interfaces import Method
 from essjax.metrics import aggregate, psnr, score_rollout
 from essjax.rollout import ESS, SS, Schedule, alternate, check_supported, every, stream_step
-from essjax.typing import PyTree
+from essjax.typing import Array, PyTree
 from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
 
 EXTRA_METRICS = ("psnr_foreground", "psnr_reference")
@@ -60,7 +60,7 @@ def load_clip(dataset: Dataset, segment: Segment, warmup: int) -> Clip:
 
 
 @jax.jit
-def _estimated_valid(frames: Frame) -> jax.Array:
+def _estimated_valid(frames: Frame) -> Array:
     previous = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), frames)
     return hole_mask(
         frames.gbuffers, previous.gbuffers, frames.motion, jitter=frames.jitter, jitter_previous=previous.jitter
@@ -102,14 +102,14 @@ def schedules(method: Method) -> list[Schedule]:
 
 
 @functools.partial(jax.jit, static_argnames="scale")
-def reference_at_samples(reference: jax.Array, frames: Frame, scale: int) -> jax.Array:
+def reference_at_samples(reference: Array, frames: Frame, scale: int) -> Array:
     """The reference read where each LR sample was taken, ``[T, H, W, 3]``."""
-    positions = scale * pixel_positions(*frames.motion.shape[-3:-1], frames.jitter)
+    positions = scale * pixel_positions(frames.motion.shape[-3], frames.motion.shape[-2], frames.jitter)
     return jnp.maximum(sample(reference, positions, mode="bilinear"), 0.0)
 
 
 @jax.jit
-def _masked_psnr(images: jax.Array, targets: jax.Array, mask: jax.Array) -> jax.Array:
+def _masked_psnr(images: Array, targets: Array, mask: Array) -> Array:
     return psnr(display(images), display(targets), mask=mask)
 
 
@@ -190,13 +190,19 @@ def evaluate(
     lock = threading.Lock()
     with ThreadPoolExecutor(2) as pool:  # most of the time is compilation, which two threads do side by side
         list(pool.map(run_method, runners))
-    return {"rows": _summarise(curves), "curves": curves, "pictures": [_sorted_images(p, runners) for p in _ordered(shown)]}
+    return {
+        "rows": _summarise(curves),
+        "curves": curves,
+        "pictures": [_sorted_images(p, runners) for p in _ordered(shown)],
+    }
 
 
 def _sorted_images(picture: dict, names: Iterable[str]) -> dict:
     """The images in the table's order, whichever thread came first."""
     order = ["input", *names, "reference"]
-    parts = {part: {name: picture[part][name] for name in order if name in picture[part]} for part in ("images", "previous")}
+    parts = {
+        part: {name: picture[part][name] for name in order if name in picture[part]} for part in ("images", "previous")
+    }
     return {**picture, **parts}
 
 
@@ -217,14 +223,15 @@ def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, image
 
 def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
     frames, scale = clip.sequence.frames, 1 if low else clip.sequence.scale
-    target = frames.color if low else clip.sequence.reference
+    rendered = rendered_color(frames, "the report")
+    target = rendered if low else clip.sequence.reference
     # What was rendered last: this frame, or the one before where this one is extrapolated.
     inputs = {"images": n if kind == SS else n - 1, "previous": n - 1 if kind == SS else n - 1}
     picture: dict[str, Any] = {
         "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
     }  # fmt: skip
     for part, index in inputs.items():
-        color = np.repeat(np.repeat(np.asarray(frames.color[max(index, 0)]), scale, 0), scale, 1)
+        color = np.repeat(np.repeat(np.asarray(rendered[max(index, 0)]), scale, 0), scale, 1)
         picture[part] = {"input": color, "reference": np.asarray(target[n if part == "images" else max(n - 1, 0)])}
     return picture
 

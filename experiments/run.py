@@ -30,7 +30,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--set", dest="overrides", metavar="KEY=VALUE", nargs="+", action="extend", default=[])
     parser.add_argument("--resume", action="store_true", help="continue an interrupted run in --out")
     parser.add_argument("--eval-only", action="store_true", help="evaluate the checkpoint in --out, no training")
-    parser.add_argument("--profile", action="store_true", help="write a JAX profiler trace of train and streaming steps")
+    parser.add_argument(
+        "--profile", action="store_true", help="write a JAX profiler trace of train and streaming steps"
+    )
     parser.add_argument("--list", action="store_true", help="list the variants and stop")
     return parser.parse_args(arguments)
 
@@ -108,11 +110,19 @@ def _experiment(options: argparse.Namespace, config: Config, out: Path, console:
         now = time.monotonic()
         seconds[name], clock = round(now - clock, 1), now
 
-    columns = (TextColumn("{task.description:<16}"), BarColumn(), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description:<16}"),
+        BarColumn(),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task("data", total=None, text="")
         dataset = datasets.prepare(
-            config, options.data, out, lambda n, total: progress.update(bar, completed=n, total=total, text=f"{n}/{total}")
+            config,
+            options.data,
+            out,
+            lambda n, total: progress.update(bar, completed=n, total=total, text=f"{n}/{total}"),
         )
         progress.update(bar, completed=1, total=1, text=datasets.describe(dataset))
         lap("data")
@@ -120,7 +130,9 @@ def _experiment(options: argparse.Namespace, config: Config, out: Path, console:
         variables, training = {}, {}
         if variant.stages(config):
             if not config.vgg:
-                console.print("VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on.")
+                console.print(
+                    "VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on."
+                )
             bars: dict[str, Any] = {}
 
             def on_step(stage: str, step: int, fraction: float, terms: dict[str, float]) -> None:

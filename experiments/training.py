@@ -66,7 +66,7 @@ def train_variant(
                 checkpoints,
                 out / "train" / f"{stage.name}.jsonl",
                 stage.budget,
-                lambda progress, peak=stage.learning_rate: cosine(progress, peak=peak),
+                lambda step, progress, peak=stage.learning_rate: cosine(step, progress, peak=peak),
                 save_every=config.save_every,
                 on_step=lambda step, progress, terms, name=stage.name: on_step(name, step, progress, terms),
             )

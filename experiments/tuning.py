@@ -11,6 +11,7 @@ from essjax.frames import without_color
 from essjax.interfaces import Method
 from essjax.metrics import psnr
 from essjax.rollout import SS, check_supported
+from essjax.typing import Array
 from experiments.config import Config
 from experiments.evaluate import Clip, _batched, schedules
 from experiments.variants import Variant
@@ -72,7 +73,7 @@ def _score_grid(method: Method, grid: np.ndarray, clip: Clip) -> np.ndarray:
 
 
 @jax.jit
-def _grid_psnr(images: jax.Array, target: jax.Array) -> jax.Array:
+def _grid_psnr(images: Array, target: Array) -> Array:
     return jax.vmap(lambda image: psnr(display(image), display(target)))(images)
 
 
