@@ -28,7 +28,7 @@ def numbered(T):
 
 
 def fake(step_aux):
-    """A method whose history is ``[frame, kind]`` of the step before (-1 after a cut) and whose aux ``step_aux`` makes."""
+    """A method whose history is ``[frame, kind]`` of the step before, -1 after a cut; ``step_aux`` makes its aux."""
 
     def start(example):
         return jnp.full((*example.cut.shape, 2), -1.0)
