@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from essjax.color import demodulate
 from essjax.frames import select_time, without_color
 from essjax.methods.rendered import advance, albedo, push, reset_pair, start_pair
-from tests.helpers import make_frames
+from tests.helpers import make_frames, random_image
 
 T, B, H, W = 4, 2, 7, 10
 
 
 def random_frames(seed):
-    return make_frames(seed, T=T, B=B, H=H, W=W)
+    frames = make_frames(seed, T=T, B=B, H=H, W=W)
+    return dataclasses.replace(frames, jitter=random_image(seed, T, B, 2, low=-0.5, high=0.5))  # another every frame
 
 
 @jax.jit
@@ -85,12 +86,22 @@ def test_paths_equal_brute_force(seed):
 
 
 def test_jitter_moves_the_lookup_and_not_the_motion():
-    motion = jnp.array([0.75, -0.5])
+    """Motion that grows linearly over the image, where interpolation is exact: where it was read shows in its value."""
     frames = random_frames(2)
-    frames = dataclasses.replace(frames, motion=jnp.broadcast_to(motion, frames.motion.shape))
+    x, y = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
+    steady = np.broadcast_to([0.75, -0.5], (H, W, 2))
+    growing = np.stack([0.1 * x - 0.2, 0.07 * y + 0.05 * x], axis=-1)
+    motion = np.broadcast_to(np.stack([steady, steady, growing, steady])[:, None], (T, B, H, W, 2))
+    frames = dataclasses.replace(frames, motion=jnp.asarray(motion, jnp.float32))
     memory = walk(frames)[-1].frames
-    np.testing.assert_allclose(memory.motion[0], jnp.broadcast_to(motion, (B, H, W, 2)), atol=1e-6)
-    np.testing.assert_allclose(memory.motion[1], jnp.broadcast_to(3 * motion, (B, H, W, 2)), atol=1e-5)
+    np.testing.assert_allclose(memory.motion[0], np.broadcast_to(steady, (B, H, W, 2)), atol=1e-6)
+    jitter = np.asarray(frames.jitter)
+    for b in range(B):
+        first = 0.75 + jitter[3, b, 0] - jitter[2, b, 0], -0.5 + jitter[3, b, 1] - jitter[2, b, 1]
+        at_x, at_y = x + first[0], y + first[1]
+        expected = 2 * steady + np.stack([0.1 * at_x - 0.2, 0.07 * at_y + 0.05 * at_x], axis=-1)
+        inside = (slice(2, -2), slice(2, -2))
+        np.testing.assert_allclose(memory.motion[1, b][inside], expected[inside], atol=1e-5)
 
 
 def test_reset_only_where_cut():
