@@ -124,7 +124,8 @@ def _experiment(options: argparse.Namespace, config: Config, out: Path, console:
             out,
             lambda n, total: progress.update(bar, completed=n, total=total, text=f"{n}/{total}"),
         )
-        progress.update(bar, completed=1, total=1, text=datasets.describe(dataset))
+        progress.update(bar, completed=1, total=1, text=f"{len(dataset.sequences)} sequences")
+        console.print(datasets.describe(dataset), soft_wrap=True)
         lap("data")
 
         variables, training = {}, {}

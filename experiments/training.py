@@ -16,6 +16,7 @@ from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.variants import Stage, Variant
 
+MIN_CROP = 24
 OnStep = Callable[[str, int, float, dict[str, float]], None]
 """Called with stage, step, progress in [0, 1] and the terms."""
 
@@ -24,10 +25,15 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
     """A grain iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, an odd number of frames.
 
     Raises:
-      ValueError: no sequence is long enough for a clip.
+      ValueError: no sequence is long enough for a clip, or the crop is too small.
     """
     info = dataset.info
     width, height = (min(a, b) for a, b in zip(config.crop, (info.width, info.height), strict=True))
+    if min(width, height) < MIN_CROP:
+        raise ValueError(
+            f"crop: expected at least {MIN_CROP}x{MIN_CROP} LR pixels (FRNet's coarsest features are an eighth of them), "
+            f"got {width}x{height} from crop {config.crop} of {info.width}x{info.height} frames."
+        )
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
     length = min(config.clip, longest)
     length -= 1 - length % 2  # SS/ESS pairs from frames 0 and 1 need an odd number

@@ -8,20 +8,20 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from essjax.color import expm1, log1p
+from essjax.color import expm1, log1p, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import Frame, GBuffers, Prediction, depth_scale, network_depth, rendered_color, select_time
 from essjax.interfaces import Method, MethodInfo, Network, no_variables, reset_at_cut
 from essjax.methods.rendered import RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
+from essjax.methods.taau import Resampled, gaussian_resample
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
 from essjax.typing import Array, Color, Image, Jitter, Mask, PyTree, pytree
 from essjax.warp import (
     backward_warp,
     depth_to_space,
+    dilate_motion,
     hole_mask,
     inside_mask,
-    jitter_aligned_upsample,
-    sample_distance,
     space_to_depth,
     upsample_motion,
 )
@@ -205,8 +205,9 @@ class Warped:
 
 
 def warp_history(history: History, frame: Frame, scale: int) -> Warped:
-    """Plain backward warp of the HR output and where it may be trusted (f_r of eq 10)."""
-    motion = upsample_motion(frame.motion, scale, jitter=frame.jitter)
+    """Backward warp of the HR output and where it may be trusted (f_r of eq 10)."""
+    # Dilated, so that the history of a silhouette moves with the surface in front.
+    motion = upsample_motion(dilate_motion(frame.motion, frame.gbuffers.depth), scale, jitter=frame.jitter)
     valid_low = hole_mask(
         frame.gbuffers, history.gbuffers, frame.motion, jitter=frame.jitter, jitter_previous=history.jitter
     )
@@ -225,26 +226,21 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
     return jnp.log(share) - jnp.log1p(-share)
 
 
-SAMPLE_SHARE = 0.7
-"""Share of a rendered sample that lies on the centre of an HR pixel; less with distance (Gaussian, below)."""
 SAMPLE_SIGMA = 0.8
-"""Its standard deviation, HR pixels."""
+    """Logit of the current sample's share before training: ``weight`` on trusted history, nearly all elsewhere."""
 EXTRAPOLATED_SHARE = 0.4
-"""Share of the LR extrapolation on ESS frames, where history is trusted."""
+"""Share of the LR extrapolation on ESS frames, where history is trusted, before training."""
 
 
-def _sample_weight(frame: Frame, scale: int) -> Array:
-    height, width = frame.motion.shape[-3:-1]
-    distance = sample_distance(height, width, scale, frame.jitter)
-    squared = jnp.sum(distance**2, axis=-1, keepdims=True)
-    return SAMPLE_SHARE * jnp.exp(-0.5 * squared / SAMPLE_SIGMA**2) + 0.02
+def _compose(head: Array, warped: Warped, current: Resampled, weight: Array | float, scale: int) -> Image:
+    """Blend history and ``current`` (both log1p, HR) by the corrected prior and add the residual.
 
-
-def _compose(head: Array, warped: Warped, current: Image, weight: Array | float, scale: int) -> Image:
-    """Blend history and ``current`` (both log1p, HR) by the corrected prior and add the residual."""
+    History is clamped to the YCoCg box of the current samples, as every TAA does: what lies outside is no longer there.
+    """
     output = depth_to_space(head, scale)
+    history = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped.log_image), current.low, current.high))
     share = jax.nn.sigmoid(_prior(warped.valid, weight) + output[..., :1])
-    return warped.log_image + share * (current - warped.log_image) + output[..., 1:]
+    return history + share * (current.color - history) + output[..., 1:]
 
 
 def extrass(
@@ -307,18 +303,19 @@ def extrass(
         return [], [log1p(warp), frame.gbuffers.base_color]
 
     def _inputs(frame: Frame, history: History, warped: Warped, color: Color, extra: list[Image]):
-        """Inputs of E0 or E1 at LR, and the LR colour aligned to HR (log1p)."""
-        aligned = jitter_aligned_upsample(log1p(color), scale, frame.jitter)
+        """Inputs of E0 or E1 at LR, and the LR colour (log1p) resampled to the HR grid."""
+        encoded = log1p(color)
+        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), scale)
         shape = frame.gbuffers.depth.shape[:-1]
         low = [
-            log1p(color),
+            encoded,
             network_depth(frame.gbuffers, history.depth_scale),
             warped.valid_low,
             jnp.broadcast_to(frame.jitter[..., None, None, :], (*shape, 2)),
             *extra,
         ]
-        high = [space_to_depth(aligned, scale), space_to_depth(warped.log_image, scale)]
-        return jnp.concatenate([*high, *low], axis=-1), aligned
+        high = [space_to_depth(current.color, scale), space_to_depth(warped.log_image, scale)]
+        return jnp.concatenate([*high, *low], axis=-1), current
 
     def _finish(history: History, frame: Frame, rendered: RenderedPair, log_image: Image) -> tuple[History, Color]:
         image = expm1(log_image)
@@ -336,10 +333,10 @@ def extrass(
         history = reset(frame, history)
         warped = warp_history(history, frame, scale)
         color = rendered_color(frame, info.name)
-        inputs, aligned = _inputs(frame, history, warped, color, _extras(frame, color)[0])
+        inputs, current = _inputs(frame, history, warped, color, _extras(frame, color)[0])
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
-        weight = _sample_weight(frame, scale)
-        log_image = _compose(head, warped, aligned, weight, scale)
+        weight = jnp.clip(current.weight, 0.02, 0.98)
+        log_image = _compose(head, warped, current, weight, scale)
         rendered = push(advance(history.rendered, frame), frame)
         history, image = _finish(history, frame, rendered, log_image)
         aux = {"log_image": log_image, "warped": warped, "features": features}
@@ -350,9 +347,9 @@ def extrass(
         warped = warp_history(history, frame, scale)
         rendered = advance(history.rendered, frame)
         low = _extrapolate(flow_network, variables["frnet"], rendered, frame, sigmas)
-        inputs, aligned = _inputs(frame, history, warped, low.image, _extras(frame, low.warp)[1])
+        inputs, current = _inputs(frame, history, warped, low.image, _extras(frame, low.warp)[1])
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="extrapolate")
-        log_image = _compose(head, warped, aligned, EXTRAPOLATED_SHARE, scale)
+        log_image = _compose(head, warped, current, EXTRAPOLATED_SHARE, scale)
         history, image = _finish(history, frame, rendered, log_image)
         aux = {"log_image": log_image, "warped": warped, "features": features, "extrapolated": low}
         return history, Prediction(image=image, aux=aux)
