@@ -31,7 +31,7 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
     width, height = (min(a, b) for a, b in zip(config.crop, (info.width, info.height), strict=True))
     if min(width, height) < MIN_CROP:
         raise ValueError(
-            f"crop: expected at least {MIN_CROP}x{MIN_CROP} LR pixels (FRNet's coarsest features are an eighth of them), "
+            f"crop: expected at least {MIN_CROP}x{MIN_CROP} LR pixels (FRNet's coarsest features are an eighth), "
             f"got {width}x{height} from crop {config.crop} of {info.width}x{info.height} frames."
         )
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))

@@ -227,7 +227,6 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
 
 
 SAMPLE_SIGMA = 0.8
-    """Logit of the current sample's share before training: ``weight`` on trusted history, nearly all elsewhere."""
 EXTRAPOLATED_SHARE = 0.4
 """Share of the LR extrapolation on ESS frames, where history is trusted, before training."""
 
