@@ -227,6 +227,7 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
 
 
 SAMPLE_SIGMA = 0.8
+"""Standard deviation of the Gaussian that brings LR samples to the HR grid, HR pixels: TAAU's best on validation."""
 EXTRAPOLATED_SHARE = 0.4
 """Share of the LR extrapolation on ESS frames, where history is trusted, before training."""
 
