@@ -74,7 +74,7 @@ def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], con
     scored = sum(len(clip.scored) for clip in clips)
     remarks = [
         f"{scored} frames of {len(clips)} sequences are scored, each as SS and as ESS; {config.warmup} frames at the "
-        f"start and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR and SSIM after x/(1+x) "
+        f"start and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR, SSIM after x/(1+x) "
         "and sRGB. HR results score against the anti-aliased reference, LR results against that frame's own jittered, "
         "aliased colour."
     ]
