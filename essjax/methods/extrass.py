@@ -30,6 +30,8 @@ SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
 """Standard deviations of base colour and normal in eq 2; not in the paper, chosen on validation data."""
 SIGMA_DISTANCE = 4.0
 """Standard deviation of the screen distance in eq 2, LR pixels."""
+RATIO_FLOOR = 0.02
+"""Radiance added to both sides of FRNet's change of shading, so that black stays black."""
 REFINE_DELTA = 0.1
 """delta_1 = delta_2 of eq 6."""
 
@@ -84,7 +86,9 @@ def refine(network: Network, variables: PyTree, warped: Color, gbuffers: GBuffer
     output, _ = network.apply(variables, small, halve(roughness))
     refined, warped = backward_warp(small[0], output["flow"]), warped[0]
     mask = jax.lax.stop_gradient(blend_mask(expm1(refined), warped, gbuffers))
-    image = jnp.where(mask > 0, _enlarge(expm1(refined), warped), warped)
+    # Not the half-size colour itself but how FRNet changed it: the detail of the full-size warp stays.
+    before, after = (_enlarge(expm1(half), warped) + RATIO_FLOOR for half in (small[0], refined))
+    image = jnp.where(mask > 0, warped * jnp.clip(after / before, 0.25, 4.0), warped)
     return {"image": image, "half": refined, "flow": output["flow"], "features": output["features"], "mask": mask}
 
 

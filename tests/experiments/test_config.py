@@ -5,7 +5,8 @@ from experiments.variants import VARIANTS, compared, get_variant
 
 
 def test_overrides_are_typed():
-    config = make_config("quick", ["size=[128,72]", "steps=10", "seconds=null", "learning_rate=1e-3", "tune=false", "vgg=w.npz"])
+    overrides = ["size=[128,72]", "steps=10", "seconds=null", "learning_rate=1e-3", "tune=false", "vgg=w.npz"]
+    config = make_config("quick", overrides)
     assert (config.size, config.steps, config.seconds, config.learning_rate) == ((128, 72), 10, None, 1e-3)
     assert config.tune is False and config.vgg == "w.npz"
 
