@@ -34,7 +34,7 @@ def keep(metrics_path: Path, name: str | None = None) -> Path:
     return path
 
 
-def page(results: list[dict[str, Any]]) -> str:
+def page(results: list[tuple[str, dict[str, Any]]]) -> str:
     """The whole page."""
     return "\n".join([HEAD, *(_section(name, metrics) for name, metrics in results)])
 
