@@ -75,8 +75,8 @@ PRESETS: dict[str, Config] = {
         seconds=None, save_every=300.0, pictures=2,
     ),
 }  # fmt: skip
-"""smoke: every part runs, <= 60 s. quick: the default, <= 10 minutes on two cores. paper: the papers' settings
-(an epoch is counted as one crop from each of 120 sequences' 60 frames: 900 batches of 8, 600 of 12)."""
+"""smoke: every part runs once, two minutes of compilation. quick: the default, ten minutes on two cores. paper: the
+papers' settings (an epoch is counted as one crop from each of 120 sequences' 60 frames: 900 batches of 8, 600 of 12)."""
 
 PRESET_NAMES = tuple(PRESETS)
 
