@@ -76,7 +76,7 @@ PRESETS: dict[str, Config] = {
     ),
 }  # fmt: skip
 """smoke: every part runs once, two minutes of compilation. quick: the default, ten minutes on two cores. paper: the
-papers' settings (an epoch is counted as one crop from each of 120 sequences' 60 frames: 900 batches of 8, 600 of 12)."""
+papers' settings (an epoch: one crop from each of 120 sequences' 60 frames, 900 batches of 8 or 600 of 12)."""
 
 PRESET_NAMES = tuple(PRESETS)
 
