@@ -82,9 +82,9 @@ class Runner:
             raise ValueError(f"{self.method.info.name} needs frames at native resolution, which this dataset lacks.")
         check_supported(self.method, frames, schedule)
         length = frames.motion.shape[0]
-        history, images = self._start(_batched(frames, 0)), []
+        history, images = self._start(frame_with_batch_axis(frames, 0)), []
         for n, kind in enumerate(schedule.kinds(length)):
-            frame = _batched(frames, n)
+            frame = frame_with_batch_axis(frames, n)
             frame = frame if kind == SS else without_color(frame)
             history, image = self._steps[kind](self.variables, history, frame)
             images.append(np.asarray(image[0]))
@@ -92,7 +92,8 @@ class Runner:
         return np.stack(images[late:] + images[-1:] * late)
 
 
-def _batched(frames: Frame, n: int) -> Frame:
+def frame_with_batch_axis(frames: Frame, n: int) -> Frame:
+    """Frame ``n`` of time-major frames without a batch axis, as a batch of one."""
     return jax.tree.map(lambda leaf: leaf[None], select_time(frames, n))
 
 

@@ -13,7 +13,7 @@ from essjax.metrics import psnr
 from essjax.rollout import SS, check_supported
 from essjax.typing import Array
 from experiments.config import Config
-from experiments.evaluate import Clip, _batched, schedules
+from experiments.evaluate import Clip, frame_with_batch_axis, schedules
 from experiments.variants import Variant
 
 ALPHAS = (0.1, 0.2, 0.4, 0.7, 1.0)
@@ -62,9 +62,9 @@ def _score_grid(method: Method, grid: np.ndarray, clip: Clip) -> np.ndarray:
     totals, count = np.zeros(len(grid)), 0
     for schedule in schedules(method):
         check_supported(method, frames, schedule)
-        history = steps["start"](variables, _batched(frames, 0))
+        history = steps["start"](variables, frame_with_batch_axis(frames, 0))
         for n, kind in enumerate(schedule.kinds(len(clip.numbers))):
-            frame = _batched(frames, n)
+            frame = frame_with_batch_axis(frames, n)
             history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
             if n in clip.scored:
                 totals += np.asarray(_grid_psnr(image[:, 0], clip.sequence.reference[n]))
