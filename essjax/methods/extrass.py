@@ -236,15 +236,22 @@ EXTRAPOLATED_SHARE = 0.4
 """Share of the LR extrapolation on ESS frames, where history is trusted, before training."""
 
 
+CLAMP_LOGIT = 0.0
+"""Logit of how far history is moved into the box of the current samples, before training."""
+
+
 def _compose(head: Array, warped: Warped, current: Resampled, weight: Array | float, scale: int) -> Image:
     """Blend history and ``current`` (both log1p, HR) by the corrected prior and add the residual.
 
-    History is clamped to the YCoCg box of the current samples, as every TAA does: what lies outside is no longer there.
+    TAA clamps history to the YCoCg box of the current samples: ghosts go, and so does detail finer than the samples.
+    How far to go there is the network's choice.
     """
     output = depth_to_space(head, scale)
-    history = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped.log_image), current.low, current.high))
     share = jax.nn.sigmoid(_prior(warped.valid, weight) + output[..., :1])
-    return history + share * (current.color - history) + output[..., 1:]
+    clamping = jax.nn.sigmoid(CLAMP_LOGIT + output[..., 1:2])
+    clamped = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped.log_image), current.low, current.high))
+    history = warped.log_image + clamping * (clamped - warped.log_image)
+    return history + share * (current.color - history) + output[..., 2:]
 
 
 def extrass(
