@@ -77,6 +77,8 @@ class _Part(NamedTuple):
     """First and last column and row of the stored pixels: x0, y0, x1, y1, both ends included."""
     display: tuple[int, int, int, int]
     """The same of the image."""
+    tile: tuple[int, int]
+    """Height and width; OpenEXR allocates a whole one even for a smaller image."""
     deep: bool
     subsampled: tuple[str, ...]
 
@@ -99,11 +101,13 @@ def _window(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int, int, int]:
 
 def _part(part: OpenEXR.Part) -> _Part:
     header = part.header
+    tiles = header.get("tiles")
     return _Part(
         str(header.get("name", "")),
         tuple(channel.name for channel in header["channels"]),
         _window(header["dataWindow"]),
         _window(header["displayWindow"]),
+        (tiles.ySize, tiles.xSize) if tiles else (1, 1),
         header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile),
         tuple(channel.name for channel in header["channels"] if (channel.xSampling, channel.ySampling) != (1, 1)),
     )
@@ -118,10 +122,12 @@ def _check_part(path: Path, part: _Part) -> None:
             f"{path}: the channels {_list(part.subsampled)} are subsampled (luminance-chroma). Export as RGB."
         )
     (x0, y0, x1, y1), (left, top, right, bottom) = part.data, part.display
-    height, width = part.shape
-    allowed = SMALL_IMAGE + MAX_COMPRESSION * path.stat().st_size
-    if height < 1 or width < 1 or 4 * height * width * len(part.channels) > allowed or right < left or bottom < top:
-        raise ValueError(f"{path}: the file is damaged (an image of {width}x{height}). Download or render it again.")
+    allowed = (SMALL_IMAGE + MAX_COMPRESSION * path.stat().st_size) / (4 * max(1, len(part.channels)))
+    for what, (height, width) in (("an image", part.shape), ("tiles", part.tile)):
+        if height < 1 or width < 1 or height * width > allowed:
+            raise ValueError(f"{path}: the file is damaged ({what} of {width}x{height}). Download or render it again.")
+    if right < left or bottom < top:
+        raise ValueError(f"{path}: the file is damaged (an empty display window). Download or render it again.")
     if left < x0 or top < y0 or right > x1 or bottom > y1:
         raise ValueError(
             f"{path}: the file holds the pixels {x0}..{x1} x {y0}..{y1} (data window) of an image {left}..{right} x "

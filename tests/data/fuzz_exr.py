@@ -23,6 +23,8 @@ SLOW = 2.0
 """Seconds after which one file counts as a hang."""
 MEMORY = 1 << 30
 """More resident memory than this, in bytes, counts as a huge allocation."""
+ADDRESSES = 8 << 30
+"""Bytes a child may reserve: a file that asks for more raises MemoryError and does not take the machine down."""
 
 
 def seeds(folder: Path) -> list[bytes]:
@@ -85,6 +87,7 @@ def child(folder: Path, seed: int, seconds: float) -> dict:
     """Read mutants until the time is over; the one being read lies in ``folder/mutant.exr``."""
     from essjax.data import exr
 
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
     rng, files = np.random.default_rng(seed), seeds(folder)
     end, counts, slowest, before = time.monotonic() + seconds, {"read": 0, "refused": 0}, 0.0, resident()
     while time.monotonic() < end:
@@ -95,7 +98,7 @@ def child(folder: Path, seed: int, seconds: float) -> dict:
             exr.read(path)
             counts["read"] += 1
         except ValueError as error:
-            if not str(error).startswith(str(path)):
+            if not str(error).startswith(str(path)) or isinstance(error.__cause__, MemoryError):
                 raise
             counts["refused"] += 1
         slowest = max(slowest, time.monotonic() - start)

@@ -131,6 +131,16 @@ def test_damaged_headers(tmp_path, name, at, value):
         exr.read(path)
 
 
+def test_tiles_that_only_a_damaged_header_declares(tmp_path):
+    """Found by the fuzzer: such a file of 3 kB made the library allocate 18 GB and take minutes."""
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 8
+    path = write(tmp_path / "a.exr", {"R": ramp()}, type=OpenEXR.tiledimage, tiles=tiles)
+    path.write_bytes(patched(path.read_bytes(), b"tiles", 4, (2**26 + 8).to_bytes(4, "little")))
+    with pytest.raises(ValueError, match=r"a\.exr: the file is damaged \(tiles of 8x67108872\)"):
+        exr.read(path)
+
+
 def test_mutated_files_only_raise_value_errors():
     """4 seconds of a fixed seed; see fuzz_exr for longer runs."""
     (result,) = fuzz(4.0, seed=1)
