@@ -1,5 +1,6 @@
 """What render_essjax.py needs and Blender does not: jitter, camera shift, meta.json. Imports without bpy."""
 
+import argparse
 import json
 import os
 from pathlib import Path
@@ -68,6 +69,14 @@ def parse_frames(text: str) -> range:
     return range(int(first), int(last) + 1)
 
 
+def positive(text: str) -> int:
+    """A whole number above 0, as an argument's type."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text}")
+    return value
+
+
 def write_atomically(path: Path, text: str) -> None:
     """The old file or the new one, never half of it."""
     temporary = path.with_name(f".{path.name}.tmp")
@@ -85,7 +94,7 @@ def open_meta(path: Path, size: tuple[int, int], scale: int, source: dict) -> di
       source: what else decides about the pictures (scene, samples); a clip can only be continued with the same.
 
     Raises:
-      ValueError: the clip there was rendered with other settings.
+      ValueError: the clip there was rendered with other settings, or its meta.json is damaged.
     """
     meta = {
         "render_size": list(size),
@@ -95,7 +104,10 @@ def open_meta(path: Path, size: tuple[int, int], scale: int, source: dict) -> di
     }
     if not path.is_file():
         return {**meta, "frames": {}}
-    found = json.loads(path.read_text())
+    try:
+        found = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: not JSON ({error}). Delete the clip and render it again.") from error
     other = [key for key in meta if found.get(key) != meta[key]]
     if other:
         pairs = "; ".join(f"{key}: asked {meta[key]}, found {found.get(key)}" for key in other)

@@ -29,17 +29,22 @@ CIRCLE = 720
 
 def parse_args() -> argparse.Namespace:
     """What stands after ``--`` in Blender, all arguments with bpy."""
-    argv = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else ([] if not bpy.app.module else sys.argv[1:])
+    in_blender = bool(bpy.app.binary_path)  # empty with bpy
+    argv = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else ([] if in_blender else sys.argv[1:])
     parser = argparse.ArgumentParser(prog="render_essjax.py", description=__doc__.split("\n", 1)[0])
     parser.add_argument("--out", required=True, type=Path, help="folder of the clip")
     parser.add_argument("--scene", type=Path, help=".blend, .glb or .gltf; without it the file that Blender has open")
     parser.add_argument("--demo", action="store_true", help="render a built-in scene instead")
     parser.add_argument("--size", default="480x270", help="WIDTHxHEIGHT of the LR images")
-    parser.add_argument("--scale", type=int, default=2, help="size of the reference / LR size")
+    parser.add_argument("--scale", type=clip.positive, default=2, help="size of the reference / LR size")
     parser.add_argument("--frames", help="FIRST:LAST, both included; without it the scene's")
     parser.add_argument("--camera", help="name of the camera; without it the scene's")
-    parser.add_argument("--lr-samples", type=int, default=8, help="shading samples of a LR pixel, at one position")
-    parser.add_argument("--hr-samples", type=int, default=64, help="samples of a reference pixel, all over it")
+    parser.add_argument(
+        "--lr-samples", type=clip.positive, default=8, help="shading samples of a LR pixel, at one position"
+    )
+    parser.add_argument(
+        "--hr-samples", type=clip.positive, default=64, help="samples of a reference pixel, all over it"
+    )
     parser.add_argument("--cycles-device", help="CPU, CUDA, OPTIX, HIP, ONEAPI or METAL; Cycles itself reads this")
     return parser.parse_args(argv)
 
@@ -72,7 +77,8 @@ def add_what_gltf_lacks() -> None:
     kinds = {thing.type for thing in scene.objects}
     if "LIGHT" not in kinds:
         scene.world = bpy.data.worlds.new("sky")
-        scene.world.color = (1.0, 1.0, 1.0)
+        scene.world.use_nodes = True
+        scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
         print("no light in the file: added a white sky")
     if "CAMERA" not in kinds:
         add_circling_camera([thing for thing in scene.objects if thing.type == "MESH"])
@@ -100,10 +106,12 @@ def add_circling_camera(objects: list) -> None:
 def choose_camera(name: str | None):
     """The camera, checked to be one that meta.json can describe."""
     scene = bpy.context.scene
-    camera = bpy.data.objects.get(name) if name else scene.camera
-    if camera is None or camera.type != "CAMERA":
-        names = ", ".join(sorted(thing.name for thing in scene.objects if thing.type == "CAMERA")) or "none"
-        raise ValueError(f"camera: expected one of the scene's ({names}), got {name or 'no active camera'}.")
+    cameras = {thing.name: thing for thing in scene.objects if thing.type == "CAMERA"}
+    default = scene.camera or (next(iter(cameras.values())) if len(cameras) == 1 else None)
+    camera = cameras.get(name) if name else default
+    if camera is None:
+        names = ", ".join(sorted(cameras)) or "none"
+        raise ValueError(f"--camera: expected one of the scene's ({names}), got {name or 'no active camera'}.")
     if camera.data.type != "PERSP":
         raise ValueError(f"camera {camera.name}: expected a perspective camera, got {camera.data.type}.")
     if camera.data.shift_x or camera.data.shift_y:
@@ -192,9 +200,10 @@ def render_frame(folder: Path, frame: int, camera, layer, args: argparse.Namespa
 def main() -> None:
     """Command line."""
     args = parse_args()
-    size, name = clip.parse_size(args.size), open_scene(args)
+    size, frames = clip.parse_size(args.size), clip.parse_frames(args.frames) if args.frames else None
+    name = open_scene(args)
     scene, layer = bpy.context.scene, next(layer for layer in bpy.context.scene.view_layers if layer.use)
-    frames = clip.parse_frames(args.frames) if args.frames else range(scene.frame_start, scene.frame_end + 1)
+    frames = frames or range(scene.frame_start, scene.frame_end + 1)
     camera = choose_camera(args.camera)
     prepare(scene, layer)
     objects = [thing for thing in bpy.data.objects if thing.type in {"MESH", "CURVE", "SURFACE", "META", "FONT"}]
@@ -220,6 +229,6 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except ValueError as error:  # Blender would go on, and exit with 0
+    except (ValueError, RuntimeError, OSError) as error:  # Blender would go on, and exit with 0
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

@@ -7,14 +7,17 @@ Every line compares what the dataset says with the alternatives; the statement m
 
 import sys
 from itertools import pairwise
+from typing import Any
 
 import jax
 import numpy as np
 
 from essjax import cameras, warp
 from essjax.data import Dataset, read_dataset, read_sequence
-from essjax.frames import Frame, Sequence, select_time
+from essjax.frames import Sequence, select_time
 
+ClipFrame = Any
+"""An essjax ``Frame`` with all that the blender preset writes: colour, camera, world position, stencil."""
 SIGNS = {"as stated": (1, 1), "none": (0, 0), "x flipped": (-1, 1), "y flipped": (1, -1), "both flipped": (-1, -1)}
 MOTION_GAIN, MARGIN, RESIDUAL = 6.0, 0.5, 0.05
 """dB over no motion, dB over every alternative, pixels (99th percentile) that geometry may be off."""
@@ -36,7 +39,9 @@ def inner(region: np.ndarray) -> np.ndarray:
     return np.lib.stride_tricks.sliding_window_view(padded, (size, size), (0, 1)).min((-1, -2))
 
 
-def motion_quality(now: Frame, before: Frame, reference: np.ndarray, reference_before: np.ndarray) -> dict[str, float]:
+def motion_quality(
+    now: ClipFrame, before: ClipFrame, reference: np.ndarray, reference_before: np.ndarray
+) -> dict[str, float]:
     """PSNR of the previous reference warped to this one, on surfaces that were visible before."""
     scale = reference.shape[0] // now.motion.shape[0]
     jitters = {"jitter": now.jitter, "jitter_previous": before.jitter}
@@ -44,29 +49,30 @@ def motion_quality(now: Frame, before: Frame, reference: np.ndarray, reference_b
     mask = inner(valid * np.isfinite(now.gbuffers.depth)).repeat(scale, 0).repeat(scale, 1)
     motion = np.asarray(warp.upsample_motion(now.motion, scale, jitter=now.jitter))
     warped = {
-        name: np.asarray(warp.backward_warp(reference_before, motion * np.float32(s))) for name, s in SIGNS.items()
+        name: np.asarray(warp.backward_warp(reference_before, motion * np.asarray(s, np.float32)))
+        for name, s in SIGNS.items()
     }
     return {name: psnr(image, reference, mask) for name, image in warped.items()}
 
 
-def jitter_quality(frame: Frame, reference: np.ndarray) -> dict[str, float]:
+def jitter_quality(frame: ClipFrame, reference: np.ndarray) -> dict[str, float]:
     """PSNR of the LR colour against the reference read at pixel centre + jitter."""
     height, width = frame.motion.shape[:2]
     scale, mask = reference.shape[0] // height, np.ones((height, width, 1))
 
     def read(sign: tuple[int, int]) -> np.ndarray:
-        positions = cameras.pixel_positions(height, width, np.asarray(frame.jitter * np.float32(sign)))
+        positions = cameras.pixel_positions(height, width, frame.jitter * np.asarray(sign, np.float32))
         return np.asarray(warp.sample(reference, scale * positions, mode="bicubic"))
 
     return {name: psnr(frame.color, np.maximum(read(sign), 0), mask) for name, sign in SIGNS.items()}
 
 
-def _off(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
+def _off(a: Any, b: Any, where: np.ndarray) -> float:
     """99th percentile of the distance in pixels."""
-    return float(np.percentile(np.linalg.norm(a - b, axis=-1)[where], 99))
+    return float(np.percentile(np.linalg.norm(np.asarray(a) - np.asarray(b), axis=-1)[where], 99))
 
 
-def residuals(now: Frame, before: Frame) -> tuple[float, float]:
+def residuals(now: ClipFrame, before: ClipFrame) -> tuple[float, float]:
     """Pixels between rendered and camera motion on static surfaces, and between samples and pixel centre + jitter.
 
     The second projects world positions, which knows nothing of jitter.
@@ -76,8 +82,8 @@ def residuals(now: Frame, before: Frame) -> tuple[float, float]:
     expected = cameras.static_motion(now.camera, before.camera, positions, now.gbuffers.depth)
     hit = np.isfinite(now.gbuffers.depth[..., 0])
     projected, _ = cameras.project(now.camera, now.gbuffers.world_position)
-    static = hit & (now.gbuffers.stencil[..., 0] == 0)
-    return _off(now.motion, np.asarray(expected), static), _off(np.asarray(projected), np.asarray(positions), hit)
+    static = hit & (np.asarray(now.gbuffers.stencil)[..., 0] == 0)
+    return _off(now.motion, expected, static), _off(projected, positions, hit)
 
 
 def report(title: str, qualities: list[dict[str, float]]) -> dict[str, float]:
