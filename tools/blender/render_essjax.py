@@ -131,6 +131,7 @@ def prepare(scene, layer) -> None:
     for name in ("use_border", "use_motion_blur", "use_compositing", "use_sequencer", "use_multiview", "use_freestyle"):
         setattr(render, name, False)
     render.film_transparent = False
+    render.use_persistent_data = True  # else Cycles prepares the scene anew for every image, which takes seconds
     cycles = scene.cycles
     cycles.use_denoising = cycles.use_adaptive_sampling = cycles.use_sample_subset = cycles.use_animated_seed = False
     for other in scene.view_layers:
