@@ -98,7 +98,7 @@ def _give_material_to_bare(objects):
 def add_aovs(layer, objects) -> list[str]:
     """Add the AOVs to the view layer and to all materials; returns names of materials that had to be guessed."""
     for name, kind in AOVS.items():
-        aov = layer.aovs.add()
+        aov = layer.aovs.get(name) or layer.aovs.add()
         aov.name, aov.type = name, kind
     _give_material_to_bare(objects)
     used = {slot.material for thing in objects for slot in thing.material_slots if slot.material}

@@ -79,10 +79,10 @@ def add_what_gltf_lacks() -> None:
         scene.world = bpy.data.worlds.new("sky")
         scene.world.use_nodes = True
         scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-        print("no light in the file: added a white sky")
+        print("essjax: no light in the file: added a white sky")
     if "CAMERA" not in kinds:
         add_circling_camera([thing for thing in scene.objects if thing.type == "MESH"])
-        print("no camera in the file: added one that circles the scene, half a degree per frame")
+        print("essjax: no camera in the file: added one that circles the scene, half a degree per frame")
 
 
 def add_circling_camera(objects: list) -> None:
@@ -114,8 +114,6 @@ def choose_camera(name: str | None):
         raise ValueError(f"--camera: expected one of the scene's ({names}), got {name or 'no active camera'}.")
     if camera.data.type != "PERSP":
         raise ValueError(f"camera {camera.name}: expected a perspective camera, got {camera.data.type}.")
-    if camera.data.shift_x or camera.data.shift_y:
-        raise ValueError(f"camera {camera.name}: expected no lens shift, got one. Set Shift X and Y to 0.")
     scene.camera = camera
     for marker in scene.timeline_markers:
         marker.camera = None  # a marker would switch cameras in the middle of the clip
@@ -188,6 +186,8 @@ def render_frame(folder: Path, frame: int, camera, layer, args: argparse.Namespa
     scene = bpy.context.scene
     lr, hr = clip.image_paths(folder, frame)
     scene.frame_set(frame)
+    if camera.data.shift_x or camera.data.shift_y:  # the scene's own, perhaps animated
+        raise ValueError(f"camera {camera.name}: expected no lens shift, got one. Set Shift X and Y to 0.")
     jitter = clip.jitter(frame)
     # Set by hand, not animated: Cycles evaluates the neighbouring frames for the motion, and must find the same shift.
     camera.data.shift_x, camera.data.shift_y = clip.camera_shift(jitter, *size, camera.data.sensor_fit)
@@ -211,7 +211,7 @@ def main() -> None:
     number_objects(objects)
     guessed = materials.add_aovs(layer, objects)
     if guessed:
-        print(f"no shader to take base colour from, used the viewport's colour: {', '.join(guessed)}")
+        print(f"essjax: no shader to take base colour from, used the viewport's colour: {', '.join(guessed)}")
     args.out.mkdir(parents=True, exist_ok=True)
     source = {"scene": name, "camera": camera.name, "lr_samples": args.lr_samples, "hr_samples": args.hr_samples}
     meta = clip.open_meta(args.out / "meta.json", size, args.scale, source)
