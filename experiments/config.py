@@ -70,9 +70,8 @@ PRESETS: dict[str, Config] = {
     "paper": Config(
         size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
         train_spp=64, clip=9, crop=(128, 128), batch=12, frnet_batch=8, width=24, frnet_width=24,
-        frnet_learning_rate=1e-4,
-        learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0, frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None,
-        seconds=None, save_every=300.0, pictures=2,
+        frnet_learning_rate=1e-4, learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0,
+        frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None, seconds=None, save_every=300.0, pictures=2,
     ),
 }  # fmt: skip
 """smoke: every part runs once, two minutes of compilation. quick: the default, ten minutes on two cores. paper: the

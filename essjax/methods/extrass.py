@@ -231,8 +231,9 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
 
 
 SAMPLE_SIGMA = 0.65
-"""Standard deviation of the Gaussian that brings LR samples to the HR grid, HR pixels. This and the next three: the best
-untrained network on validation frames (experiments/LOG.md)."""
+"""Standard deviation of the Gaussian that brings LR samples to the HR grid, HR pixels.
+
+This and the next three make the best untrained network on validation frames (experiments/LOG.md)."""
 SAMPLE_SHARE = 0.6
 """Share of a sample on its own HR pixel, where history is trusted, before training."""
 EXTRAPOLATED_SHARE = 0.2

@@ -87,8 +87,9 @@ def between(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 class Builder:
     """Collects primitives, lights, sky and camera of a scene of ``frames`` frames.
 
-    ``time`` ``[T]`` is what animations are functions of. Positions are ``[3]`` or ``[T, 3]`` metres, rotations ``[3, 3]`` or ``[T, 3, 3]``. Whatever is given a time axis
-    gets an id of its own in the stencil; the rest is static, id 0.
+    ``time`` ``[T]`` is what animations are functions of. Positions are ``[3]`` or ``[T, 3]`` metres, rotations
+    ``[3, 3]`` or ``[T, 3, 3]``. Whatever is given a time axis gets an id of its own in the stencil; the rest is static,
+    id 0.
     """
 
     def __init__(self, frames: int, rng: np.random.Generator):
