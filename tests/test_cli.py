@@ -12,7 +12,7 @@ from essjax.data import clips, read_dataset, read_sequence
 from essjax.frames import select_time, validate_sequence
 from essjax.generate import Clip, generate, live_source, plan
 from essjax.scenes import TEST_ONLY_FAMILIES, TRAIN_FAMILIES
-from tests.data.test_presets import dump  # noqa: F401 (fixture)
+from tests.data.importing.test_blender import dump  # noqa: F401 (fixture)
 from tests.helpers import make_sequence
 
 
@@ -128,7 +128,13 @@ def test_import_command_prints_what_it_did(tmp_path, capsys, dump):  # noqa: F81
         "--test", "12:13",
     )  # fmt: skip
     assert code == 0
-    for text in ("20x12 -> x2", "25.0% of pixels, masked", "negative colour values │ 6, set to 0", "move │ 7", "8-13"):
+    for text in (
+        "20x12 -> x2",
+        "25.0% of pixels, masked",
+        "negative colour values │ 6, set to 0",
+        "move │ 7",
+        "frames │ 6",
+    ):
         assert text in output
     splits = read_dataset(tmp_path / "out").splits
     assert splits["validation"] == (("clip", 8, 11, 11),) and splits["test"] == (("clip", 8, 13, 12),)
@@ -141,8 +147,12 @@ def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
         (["scenes", out, "--size", "0x4"], "error: --size: expected WIDTHxHEIGHT such as 128x72, got '0x4'."),
         (["scenes", out, "--families", "gloss,glas"], "got 'glas'."),
         (["import", tmp_path / "nothing", out], "meta.json: not found."),
-        (["import", dump, out, "--preset", "unreal"], "error: --preset: expected one of blender, got 'unreal'."),
-        (["import", dump, out, "--train", "9-12"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
+        (
+            ["import", dump, out, "--preset", "maya"],
+            "error: preset: expected one of blender, unreal, extranet, arm-nss, generic, got",
+        ),
+        (["import", dump, out, "--train", "9:x"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
+        (["import", dump, out, "--train", "9-12"], "error: train: there is no sequence '9-12'; there are clip."),
         (
             ["import", dump, out, "--train", "8:20"],
             "error: train: expected first <= last within the frames 8..13, got 8..20.",

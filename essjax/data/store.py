@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -63,6 +63,20 @@ def _planes(images: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {
         key: plane for name, image in images.items() for key, plane in split_planes(name, np.asarray(image)).items()
     }
+
+
+class PreparedFrame(NamedTuple):
+    """A frame whose images are on disk, but which the sequence does not list yet.
+
+    Attributes:
+      number: original frame number.
+      described: what a sequence of such frames looks like.
+      record: its entry in ``sequence.json``.
+    """
+
+    number: int
+    described: SequenceInfo
+    record: Mapping[str, Any]
 
 
 class SequenceWriter:
@@ -168,24 +182,68 @@ class SequenceWriter:
         """
         if number in self:
             return
+        masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
         frame, reference, native = jax.tree.map(np.asarray, (frame, reference, native))
+        self._validate(number, frame, reference, native)
+        self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
+        self.commit(self._write_images(number, frame, reference, masks, native, notes or {}))
+
+    def prepare(
+        self, number: int, frame: Frame, reference: Any, *, notes: Mapping[str, Any] | None = None
+    ) -> PreparedFrame:
+        """The first half of ``write``: check a frame and write its images. Threads may prepare frames side by side.
+
+        Raises:
+          ValueError: invalid content.
+        """
+        frame, reference = jax.tree.map(np.asarray, (frame, reference))
+        self._validate(number, frame, reference, None)
+        return self._write_images(number, frame, reference, {}, None, notes or {})
+
+    def commit(self, prepared: PreparedFrame, *, cut: bool = False) -> None:
+        """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
+
+        Args:
+          prepared: from ``prepare``.
+          cut: the frame is a cut, whatever it says itself: the frame before it was left out.
+
+        Raises:
+          ValueError: it does not fit to the frames before. Its images are removed.
+        """
+        cut = cut or prepared.record["cut"]
+        try:
+            info = self._check_next(prepared.number, prepared.described, cut)
+        except ValueError:
+            self.discard(prepared.number)
+            raise
+        self.info = dataclasses.replace(info, frames=(*info.frames, {**prepared.record, "cut": cut}))
+        write_sequence_info(self.root, self.info)
+
+    def discard(self, number: int) -> None:
+        """Remove the images of a frame that is not listed."""
+        for kind in ("lr", "hr", "native"):
+            self._path(kind, number).unlink(missing_ok=True)
+
+    def _validate(self, number: int, frame: Frame, reference: np.ndarray, native: Frame | None) -> None:
         where = f"sequence {self.name}, frame {number}"
         validate_frame(frame, where, ("color",))
         if native is not None:
             validate_frame(native, f"{where}, native", ("color",))
         if not (np.isfinite(reference).all() and reference.min() >= 0):
             raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
-        masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
-        info = self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
+
+    def _write_images(
+        self, number: int, frame: Frame, reference: np.ndarray, masks: Mapping, native: Frame | None, notes: Mapping
+    ) -> PreparedFrame:
+        described = self._describe(frame, reference, masks, native)
         (self.root / self.name).mkdir(parents=True, exist_ok=True)
         clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}))
         hr = {name: reference[..., i] for i, name in enumerate("RGB")}
         clamped += exr.write(self._path("hr", number), hr)
         if native is not None:
             clamped += exr.write(self._path("native", number), _planes(frame_images(native)))
-        record = _plain({**_frame_record(number, frame, native), "notes": {**(notes or {}), "clamped": clamped}})
-        self.info = dataclasses.replace(info, frames=(*info.frames, record))
-        write_sequence_info(self.root, self.info)
+        record = _plain({**_frame_record(number, frame, native), "notes": {**notes, "clamped": clamped}})
+        return PreparedFrame(number, described, record)
 
     def _path(self, kind: str, number: int) -> Path:
         return frame_path(self.root, self.name, kind, number)
