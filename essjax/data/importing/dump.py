@@ -113,7 +113,9 @@ class RecipeClip:
         if rule.source == "halton":
             stored = convert.halton((number % rule.length) + rule.first)
         elif facts.jitter is None:
-            raise ValueError(f"{self.recipe.files['metadata']}, frame {number}: jitter is missing.")
+            raise ValueError(
+                f"{fill(self.recipe.files['metadata'], self.sequence)}, frame {number}: jitter is missing."
+            )
         else:
             stored = facts.jitter
         pixels = convert.to_pixels(stored, rule.unit, width, height, y=rule.y)
