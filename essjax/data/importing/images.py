@@ -43,10 +43,11 @@ def read_images(
 
 
 def _stacked(planes: list[np.ndarray]) -> np.ndarray:
-    image = np.empty((*planes[0].shape, len(planes)), np.float32)
+    """``[H, W, C]`` float32 over planes that stay contiguous: files hold planes, so nothing is interleaved and back."""
+    image = np.empty((len(planes), *planes[0].shape), np.float32)
     for index, plane in enumerate(planes):
-        image[..., index] = plane
-    return image
+        image[index] = plane
+    return np.moveaxis(image, 0, -1)
 
 
 def radiance(stored: np.ndarray, recipe: Recipe, facts: FrameFacts) -> tuple[np.ndarray, dict[str, int]]:
