@@ -12,7 +12,9 @@ from essjax.data import clips, read_dataset, read_sequence
 from essjax.frames import select_time, validate_sequence
 from essjax.generate import Clip, generate, live_source, plan
 from essjax.scenes import TEST_ONLY_FAMILIES, TRAIN_FAMILIES
+from tests.data.importing.dumps import truth
 from tests.data.importing.test_blender import dump  # noqa: F401 (fixture)
+from tests.data.importing.test_presets import write_extranet
 from tests.helpers import make_sequence
 
 
@@ -138,6 +140,21 @@ def test_import_command_prints_what_it_did(tmp_path, capsys, dump):  # noqa: F81
         assert text in output
     splits = read_dataset(tmp_path / "out").splits
     assert splits["validation"] == (("clip", 8, 11, 11),) and splits["test"] == (("clip", 8, 13, 12),)
+
+
+def test_import_command_of_a_dump_with_a_broken_frame(tmp_path, capsys):
+    known = truth(T=12)
+    write_extranet(tmp_path / "dump", known, reference=tmp_path / "hr")
+    path = tmp_path / "dump" / "TempleMotionVector.0005.exr"
+    path.write_bytes(path.read_bytes()[:400])
+    arguments = ["import", tmp_path / "dump", tmp_path / "out", "--preset", "extranet", "--reference", tmp_path / "hr"]
+    code, output = run(capsys, *arguments)
+    assert code == 2 and "sequence Temple, frame 5: " in output and "--skip-broken" in output
+    code, output = run(capsys, *arguments, "--skip-broken")
+    assert code == 0 and "left out, a cut follows: Temple, frame 5: " in output and "frames │ 11" in output
+    assert read_dataset(tmp_path / "out").source["skipped"] == {"Temple": [5]}
+    code, output = run(capsys, "import", tmp_path / "dump", tmp_path / "b", "--preset", "generic")
+    assert code == 2 and "error: the preset generic needs a recipe" in output
 
 
 def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811

@@ -1,5 +1,6 @@
 """The generic preset: a recipe that is odd in every respect, and recipes that are wrong."""
 
+import dataclasses
 import json
 import tomllib
 from pathlib import Path
@@ -236,14 +237,27 @@ def test_metadata_errors(tmp_path, odd):
         run()
 
 
-def test_presets_and_the_example_of_the_guide_load():
+def test_presets_and_the_examples_of_the_guide_load(tmp_path):
     for preset in ("extranet", "unreal", "arm-nss"):
         assert load_recipe(preset).motion.sign == "current-previous"
     guide = Path(__file__).parents[3] / "docs" / "guides" / "importing.md"
     blocks = [block.split("```")[0] for block in guide.read_text().split("```toml\n")[1:]]
-    complete = [block for block in blocks if "[channels]" in block]
+    complete = [block for block in blocks if "[files]" in block]
     assert len(complete) == 1
     recipe = make_recipe(tomllib.loads(complete[0]), "guide")
     assert set(recipe.channels) >= {"color", "depth", "motion", "base_color", "normal"}
-    for block in set(blocks) - set(complete):  # changes to a preset
-        tomllib.loads(block)
+    for rule in (
+        recipe.motion,
+        recipe.depth,
+        recipe.jitter,
+        recipe.color,
+        recipe.normal,
+        recipe.base_color,
+        recipe.world,
+    ):
+        for field in dataclasses.fields(rule):
+            assert f"{field.name} = " in complete[0], f"the guide does not show {field.name}"
+    change = tmp_path / "change.toml"
+    for preset, block in zip(("unreal", "arm-nss"), [b for b in blocks if b not in complete], strict=True):
+        change.write_text(block)
+        assert load_recipe(preset, change) != load_recipe(preset)
