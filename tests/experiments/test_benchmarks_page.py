@@ -34,7 +34,7 @@ def test_the_import_benchmark_measures_what_it_says(tmp_path, monkeypatch):
     monkeypatch.setattr(import_benchmark, "HEIGHT", 28)
     import_benchmark.make_dump(tmp_path, 52)
     measured = import_benchmark.measure(tmp_path, 52, with_reference=True, workers=2)
-    assert measured["frames"] == 52 and len(measured["resident_megabytes"]) == 1
+    assert measured["frames"] == 52 and len(measured["resident_megabytes"]) == 2
     assert measured["cpu_seconds_per_frame"] > 0 and 50 < measured["resident_megabytes"][0] < 5000
     text = benchmarks_page.page([("import", {"kind": "import", "machine": "2 cores", "cases": {"small": measured}})])
     assert f"| small | 52 | {measured['frames_per_second']:.1f} |" in text
