@@ -203,12 +203,13 @@ class SequenceWriter:
         self._validate(number, frame, reference, None)
         return self._write_images(number, frame, reference, {}, None, notes or {})
 
-    def commit(self, prepared: PreparedFrame, *, cut: bool = False) -> None:
+    def commit(self, prepared: PreparedFrame, *, cut: bool = False, save: bool = True) -> None:
         """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
 
         Args:
           prepared: from ``prepare``.
           cut: the frame is a cut, whatever it says itself: the frame before it was left out.
+          save: write ``sequence.json`` now. It grows with the frames, so a long import saves only now and then.
 
         Raises:
           ValueError: it does not fit to the frames before. Its images are removed.
@@ -220,7 +221,13 @@ class SequenceWriter:
             self.discard(prepared.number)
             raise
         self.info = dataclasses.replace(info, frames=(*info.frames, {**prepared.record, "cut": cut}))
-        write_sequence_info(self.root, self.info)
+        if save:
+            self.save()
+
+    def save(self) -> None:
+        """Write ``sequence.json``, if there is a frame."""
+        if self.info is not None:
+            write_sequence_info(self.root, self.info)
 
     def discard(self, number: int) -> None:
         """Remove the images of a frame that is not listed."""
@@ -257,7 +264,7 @@ class SequenceWriter:
             raise ValueError(f"{self.root / self.name}: expected at least one frame before finish().")
         if not self.info.complete:
             self.info = dataclasses.replace(self.info, complete=True)
-            write_sequence_info(self.root, self.info)
+            self.save()
         return self.info
 
 

@@ -2,9 +2,9 @@
 
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -13,6 +13,8 @@ from essjax.data.layout import SequenceInfo
 from essjax.data.store import PreparedFrame, SequenceWriter
 from essjax.frames import Frame
 
+SAVE_EVERY = 16
+"""Frames between two writes of ``sequence.json``: what a killed import loses at most."""
 OnFrame = Callable[[int, int], Any]
 """Called with (frames done, frames in all)."""
 
@@ -88,10 +90,11 @@ def write_clip(
     pending = [] if writer.complete else [number for number in clip.numbers if number > last]
     on_frames(len(clip.numbers) - len(pending))
     reasons: dict[int, str] = {}
-    with closing(_prepared(clip, writer, pending, workers or os.cpu_count() or 1)) as frames:
-        for number, future in frames:
+    with closing(_prepared(clip, writer, pending, workers or os.cpu_count() or 1)) as frames, _saved_at_last(writer):
+        for index, (number, future) in enumerate(frames):
             try:
-                writer.commit(future.result(), cut=writer.info is None or writer.info.numbers[-1] != number - 1)
+                cut = writer.info is None or writer.info.numbers[-1] != number - 1
+                writer.commit(future.result(), cut=cut, save=index % SAVE_EVERY == 0)
             except ValueError as error:
                 writer.discard(number)
                 if not skip_broken:
@@ -104,6 +107,15 @@ def write_clip(
     info = writer.finish()
     left_out = sorted(set(clip.numbers) - set(info.numbers))
     return Written(info, {number: reasons.get(number, "") for number in left_out})
+
+
+@contextmanager
+def _saved_at_last(writer: SequenceWriter) -> Iterator[None]:
+    """However it ends, the frames so far are listed."""
+    try:
+        yield
+    finally:
+        writer.save()
 
 
 def _prepared(
