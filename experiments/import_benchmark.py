@@ -130,12 +130,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=options.folder) as temporary:
         folder = Path(temporary)
         make_dump(folder, options.frames)
-        cases = {}
+        load, cases = os.getloadavg()[0], {}
         for name, with_reference in (("960x540, no reference", False), ("960x540 and a 1920x1080 reference", True)):
             cases[name] = measure(folder, options.frames, with_reference=with_reference, workers=options.workers)
             print(name, {k: v for k, v in cases[name].items() if k != "resident_megabytes"})
             print("  memory, MB:", *cases[name]["resident_megabytes"])
-    machine = f"{os.cpu_count()} CPU cores, {options.workers} threads"
+    machine = f"{os.cpu_count()} CPU cores, {options.workers} threads, load {load:.1f} from other work at the start"
     options.out.write_text(
         json.dumps({"schema": 1, "kind": "import", "machine": machine, "cases": cases}, indent=1) + "\n"
     )
