@@ -38,14 +38,14 @@ class Config:
     width: int = 16
     frnet_width: int = 16
     frnet_learning_rate: float = 1e-3
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     frnet_steps: int | None = None
-    frnet_seconds: float | None = 65.0
+    frnet_seconds: float | None = 45.0
     steps: int | None = None
-    seconds: float | None = 225.0
+    seconds: float | None = 245.0
     save_every: float = 30.0
     feature_weight: float = 0.001
-    occlusion_weight: float = 1.0
+    occlusion_weight: float = 0.3
     vgg_weight: float = 0.01
     temporal_weight: float = 0.1
     vgg: str | None = None
@@ -71,7 +71,7 @@ PRESETS: dict[str, Config] = {
         size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
         train_spp=64, clip=9, crop=(128, 128), batch=12, frnet_batch=8, width=24, frnet_width=24,
         frnet_learning_rate=1e-4,
-        learning_rate=4e-4, temporal_weight=1.0, frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None,
+        learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0, frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None,
         seconds=None, save_every=300.0, pictures=2,
     ),
 }  # fmt: skip

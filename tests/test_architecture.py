@@ -41,7 +41,7 @@ def sources() -> list[Path]:
 
 
 def project_files() -> list[Path]:
-    folders = [ROOT / name for name in ("essjax", "experiments", "tests", "docs", ".ci", ".github")]
+    folders = [ROOT / name for name in ("essjax", "experiments", "tests", "tools", "docs", ".ci", ".github")]
     nested = [path for folder in folders if folder.exists() for path in folder.rglob("*")]
     files = [path for path in [*ROOT.iterdir(), *nested] if path.is_file() and "__pycache__" not in path.parts]
     return sorted(path for path in files if path.suffix in TEXT_SUFFIXES or path.parent.name == ".ci")

@@ -1,13 +1,17 @@
 """OpenEXR files as flat dicts of channels: read everything or raise, write atomically.
 
 The OpenEXR package writes non-contiguous arrays scrambled and drops damaged parts with no more than a printed
-warning; both are caught here. Every failure is a ValueError that begins with the file's name.
+warning; both are caught here. Every failure is a ValueError that begins with the file's name. What is read is the
+image (display window): pixels around it (overscan) are left out, a file that has less is refused. The library's own
+lines about damaged files still go to stdout and stderr.
 """
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenEXR
@@ -15,6 +19,10 @@ import OpenEXR
 FULL_PRECISION = frozenset({"depth", "world_position", "motion"})
 """Layers kept in float32: half resolves 64 px of motion to 1/16 px and 1 km of depth to 0.5 m."""
 HALF_MAX = 65504.0
+SMALL_IMAGE = 512 << 20
+"""A file may always declare this many bytes of pixels ..."""
+MAX_COMPRESSION = 2000
+"""... and this many more for each byte it has; beyond, its header is damaged. A constant image reaches 1259 (PXR24)."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _LFS = b"version https://git-lfs"
 
@@ -48,11 +56,11 @@ def _check_file(path: Path) -> None:
         raise ValueError(f"{path}: expected an EXR file, found {what}. Download or render it again.")
 
 
-def _open(path: Path, header_only: bool) -> OpenEXR.File:
+def _open(path: Path, *, header_only: bool) -> list[OpenEXR.Part]:
     try:
-        return OpenEXR.File(str(path), separate_channels=True, header_only=header_only, num_threads=0)
-    except (RuntimeError, ValueError, TypeError) as error:  # UnicodeDecodeError is a ValueError
-        raise ValueError(f"{path}: the EXR header is damaged ({error}). Download or render it again.") from error
+        return OpenEXR.File(str(path), separate_channels=True, header_only=header_only, num_threads=0).parts
+    except (RuntimeError, ValueError, TypeError, MemoryError) as error:  # UnicodeDecodeError is a ValueError
+        raise ValueError(f"{path}: the file is damaged ({error}). Download or render it again.") from error
 
 
 def _list(names: Iterable[str], limit: int = 12) -> str:
@@ -60,23 +68,122 @@ def _list(names: Iterable[str], limit: int = 12) -> str:
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
+class _Part(NamedTuple):
+    """What the header says of a part."""
+
+    name: str
+    channels: tuple[str, ...]
+    data: tuple[int, int, int, int]
+    """First and last column and row of the stored pixels: x0, y0, x1, y1, both ends included."""
+    display: tuple[int, int, int, int]
+    """The same of the image."""
+    tile: tuple[int, int]
+    """Height and width; OpenEXR allocates a whole one even for a smaller image."""
+    deep: bool
+    subsampled: tuple[str, ...]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        x0, y0, x1, y1 = self.data
+        return y1 - y0 + 1, x1 - x0 + 1
+
+    @property
+    def inside(self) -> tuple[slice, slice]:
+        """Where the image lies in the stored pixels."""
+        x, y, (x0, y0, x1, y1) = self.data[0], self.data[1], self.display
+        return slice(y0 - y, y1 - y + 1), slice(x0 - x, x1 - x + 1)
+
+
+def _window(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int, int, int]:
+    (x0, y0), (x1, y1) = np.asarray(window).tolist()
+    return x0, y0, x1, y1
+
+
+def _part(part: OpenEXR.Part) -> _Part:
+    header = part.header
+    tiles = header.get("tiles")
+    return _Part(
+        str(header.get("name", "")),
+        tuple(channel.name for channel in header["channels"]),
+        _window(header["dataWindow"]),
+        _window(header["displayWindow"]),
+        (tiles.ySize, tiles.xSize) if tiles else (1, 1),
+        header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile),
+        tuple(channel.name for channel in header["channels"] if (channel.xSampling, channel.ySampling) != (1, 1)),
+    )
+
+
+def _check_part(path: Path, part: _Part) -> None:
+    """Refuse what is not one value per pixel of the image, and sizes that only a damaged header declares."""
+    if part.deep:
+        raise ValueError(f"{path}, part {part.name}: deep data has many values per pixel. Export it flattened.")
+    if part.subsampled:
+        raise ValueError(
+            f"{path}: the channels {_list(part.subsampled)} are subsampled (luminance-chroma). Export as RGB."
+        )
+    (x0, y0, x1, y1), (left, top, right, bottom) = part.data, part.display
+    allowed = (SMALL_IMAGE + MAX_COMPRESSION * path.stat().st_size) / (4 * max(1, len(part.channels)))
+    for what, (height, width) in (("an image", part.shape), ("tiles", part.tile)):
+        if height < 1 or width < 1 or height * width > allowed:
+            raise ValueError(f"{path}: the file is damaged ({what} of {width}x{height}). Download or render it again.")
+    if right < left or bottom < top:
+        raise ValueError(f"{path}: the file is damaged (an empty display window). Download or render it again.")
+    if left < x0 or top < y0 or right > x1 or bottom > y1:
+        raise ValueError(
+            f"{path}: the file holds the pixels {x0}..{x1} x {y0}..{y1} (data window) of an image {left}..{right} x "
+            f"{top}..{bottom} (display window). Render the whole image, without a crop or render region."
+        )
+
+
+def _headers(path: Path) -> tuple[list[_Part], dict]:
+    """All parts, and the header of the first."""
+    raw = _open(path, header_only=True)
+    try:
+        parts = [_part(part) for part in raw]
+        header = dict(raw[0].header)
+    except (KeyError, ValueError, TypeError, IndexError) as error:  # names that are not UTF-8, missing attributes
+        raise ValueError(f"{path}: the file is damaged ({error}). Download or render it again.") from error
+    for part in parts:
+        _check_part(path, part)
+    return parts, header
+
+
+def _full_names(parts: list[_Part]) -> list[dict[str, str]]:
+    """Per part, name in the file -> name in the result: with the part's name before it if several parts use it."""
+    count = Counter(name for part in parts for name in part.channels)
+    return [{n: n if count[n] == 1 else f"{part.name}.{n}" for n in part.channels} for part in parts]
+
+
+def _planes(names: Mapping[str, str], described: _Part, part: OpenEXR.Part) -> dict[str, np.ndarray]:
+    """The channels of a part that could be read, cropped to the image."""
+    planes = {names[name]: channel.pixels for name, channel in part.channels.items() if name in names}
+    return {
+        name: np.ascontiguousarray(plane[described.inside])
+        for name, plane in planes.items()
+        if isinstance(plane, np.ndarray) and plane.shape == described.shape
+    }
+
+
 def read_all(path: str | os.PathLike, expect: Iterable[str] = ()) -> tuple[dict[str, np.ndarray], dict]:
     """``read``, and the header of the first part."""
     path = Path(path)
     _check_file(path)
-    declared = {channel.name for part in _open(path, True).parts for channel in part.header["channels"]}
+    described, header = _headers(path)
+    names = _full_names(described)
+    declared = {full for part in names for full in part.values()}
     missing = set(expect) - declared
     if missing:
         raise ValueError(f"{path}: expected the channels {_list(missing)}; the file has {_list(declared)}.")
-    parts = _open(path, False).parts
-    channels = {name: np.ascontiguousarray(c.pixels) for part in parts for name, c in part.channels.items()}
+    channels: dict[str, np.ndarray] = {}
+    for part in _open(path, header_only=False):  # without the damaged ones
+        channels |= _planes(names[part.part_index], described[part.part_index], part)
     lost = declared - set(channels)
     if lost:
         raise ValueError(
             f"{path}: the file is truncated or damaged: the channels {_list(lost)} cannot be read. "
             "Download or render it again."
         )
-    return channels, dict(parts[0].header)
+    return channels, header
 
 
 def read(path: str | os.PathLike, expect: Iterable[str] = ()) -> dict[str, np.ndarray]:
@@ -87,10 +194,12 @@ def read(path: str | os.PathLike, expect: Iterable[str] = ()) -> dict[str, np.nd
       expect: full channel names that must be there, such as ``"ViewLayer.Depth.Z"``.
 
     Returns:
-      Channel name -> ``[H, W]`` float16, float32 or uint32, contiguous, row 0 on top. Parts may differ in size.
+      Channel name -> ``[H, W]`` float16, float32 or uint32, contiguous, row 0 on top, of the display window. A name
+      that several parts use, such as ``R``, becomes ``<part>.R``.
 
     Raises:
-      ValueError: missing, empty, LFS pointer, not EXR, damaged or truncated, or a channel is missing.
+      ValueError: missing, empty, LFS pointer, not EXR, damaged or truncated, a channel is missing, deep or subsampled
+        data, or a data window that does not cover the image.
     """
     return read_all(path, expect)[0]
 

@@ -241,21 +241,31 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
     return jnp.log(share) - jnp.log1p(-share)
 
 
-SAMPLE_SIGMA = 0.8
-"""Standard deviation of the Gaussian that brings LR samples to the HR grid, HR pixels: TAAU's best on validation."""
-EXTRAPOLATED_SHARE = 0.4
+SAMPLE_SIGMA = 0.65
+"""Standard deviation of the Gaussian that brings LR samples to the HR grid, HR pixels. This and the next three: the best
+untrained network on validation frames (experiments/LOG.md)."""
+SAMPLE_SHARE = 0.6
+"""Share of a sample on its own HR pixel, where history is trusted, before training."""
+EXTRAPOLATED_SHARE = 0.2
 """Share of the LR extrapolation on ESS frames, where history is trusted, before training."""
+
+
+CLAMP_LOGIT = -1.0
+"""Logit of how far history is moved into the box of the current samples, before training."""
 
 
 def _compose(head: Array, warped: Warped, current: Resampled, weight: Array | float, scale: int) -> Image:
     """Blend history and ``current`` (both log1p, HR) by the corrected prior and add the residual.
 
-    History is clamped to the YCoCg box of the current samples, as every TAA does: what lies outside is no longer there.
+    TAA clamps history to the YCoCg box of the current samples: ghosts go, and so does detail finer than the samples.
+    How far to go there is the network's choice.
     """
     output = depth_to_space(head, scale)
-    history = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped.log_image), current.low, current.high))
     share = jax.nn.sigmoid(_prior(warped.valid, weight) + output[..., :1])
-    return history + share * (current.color - history) + output[..., 1:]
+    clamping = jax.nn.sigmoid(CLAMP_LOGIT + output[..., 1:2])
+    clamped = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped.log_image), current.low, current.high))
+    history = warped.log_image + clamping * (clamped - warped.log_image)
+    return history + share * (current.color - history) + output[..., 2:]
 
 
 def extrass(
@@ -351,7 +361,7 @@ def extrass(
         color = rendered_color(frame, info.name)
         inputs, current = _inputs(frame, history, warped, color, _extras(frame, color)[0])
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
-        weight = jnp.clip(current.weight, 0.02, 0.98)
+        weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98)
         log_image = _compose(head, warped, current, weight, scale)
         rendered = push(advance(history.rendered, frame), frame)
         history, image = _finish(history, frame, rendered, log_image)

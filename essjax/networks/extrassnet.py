@@ -1,8 +1,9 @@
 """ExtraSSNet: one U-Net for supersampled and extrapolated frames (ExtraSS section 4.4, eq 10).
 
 Two encoders E0 (SS) and E1 (ESS), one decoder. All convolution runs at LR or below: HR inputs come in by
-space-to-depth, the output leaves by depth-to-space. The head predicts, per HR pixel, a correction to the blending logit
-of its two candidates and a residual, and starts at zero, so that the untrained network returns the prior blend.
+space-to-depth, the output leaves by depth-to-space. The head predicts, per HR pixel, corrections to two logits (how
+to blend history and sample, how far to clamp history) and a residual, and starts at zero, so that the untrained network
+returns the prior blend.
 """
 
 import flax.linen as nn
@@ -14,6 +15,8 @@ from essjax.networks.linen import from_linen
 from essjax.typing import Image
 
 LEVELS = 4
+HEAD = 5
+"""Outputs per HR pixel: blending logit, clamping logit, residual RGB."""
 
 
 class Encoder(nn.Module):
@@ -64,7 +67,7 @@ class ExtraSSNet(nn.Module):
         widths = (self.width, self.width * 3 // 2, self.width * 2, self.width * 3)
         self.encoder_ss = Encoder(widths)
         self.encoder_ess = Encoder(widths)
-        self.decoder = Decoder(widths, 4 * self.scale**2)
+        self.decoder = Decoder(widths, HEAD * self.scale**2)
 
     def _run(self, encoder: Encoder, inputs: Image) -> tuple[Image, list[Image]]:
         height, width = inputs.shape[-3:-1]
@@ -72,7 +75,7 @@ class ExtraSSNet(nn.Module):
         return crop(self.decoder(features), height, width), features
 
     def render(self, inputs: Image, train: bool = False) -> tuple[Image, list[Image]]:
-        """SS: ``(head [B, H, W, 4 scale^2], features of 4 levels)`` from E0's inputs."""
+        """SS: ``(head [B, H, W, HEAD * scale^2], features of 4 levels)`` from E0's inputs."""
         return self._run(self.encoder_ss, inputs)
 
     def extrapolate(self, inputs: Image, train: bool = False) -> tuple[Image, list[Image]]:

@@ -8,6 +8,9 @@ from essjax.scenes.materials import Material
 from essjax.scenes.world import BOX, CAPACITY, COLUMN, COLUMNS, LIGHTS, OFFSET, RECT, ROD, ROWS, SPHERE, World
 
 KIND_NAMES = ("rects", "boxes", "spheres", "rods")
+PACE = 0.5
+"""Time that passes per frame; the families' speeds are per unit of time. Chosen so that the median pixel moves by about
+1 % of the image width per frame, as in fast play at 60 Hz; see experiments/LOG.md."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,12 +87,13 @@ def between(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 class Builder:
     """Collects primitives, lights, sky and camera of a scene of ``frames`` frames.
 
-    Positions are ``[3]`` or ``[T, 3]`` metres, rotations ``[3, 3]`` or ``[T, 3, 3]``. Whatever is given a time axis
+    ``time`` ``[T]`` is what animations are functions of. Positions are ``[3]`` or ``[T, 3]`` metres, rotations ``[3, 3]`` or ``[T, 3, 3]``. Whatever is given a time axis
     gets an id of its own in the stencil; the rest is static, id 0.
     """
 
     def __init__(self, frames: int, rng: np.random.Generator):
         self.frames, self.rng = frames, rng
+        self.time = PACE * np.arange(frames)
         self.ids = 0
         self.rows: list[list[tuple]] = [[], [], [], []]
         self.lights: list[tuple] = []

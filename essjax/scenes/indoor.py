@@ -1,6 +1,7 @@
 """Families with walls: corridor, carousel, gloss.
 
-Metres and frames; speeds are chosen for 0.01 to 0.03 image widths per frame: 2 to 6 pixels of 192.
+Metres and ``Builder.time``; speeds are chosen for 0.02 to 0.05 image widths per unit of time, that is 2 to 5 pixels of
+192 per frame.
 """
 
 import numpy as np
@@ -12,17 +13,17 @@ from essjax.scenes.builder import FLOOR, Builder, rotation
 def swing(b: Builder, amplitude: float, speed: float) -> np.ndarray:
     """``[T]``: back and forth within ``amplitude`` (a length or an angle), random phase.
 
-    A rounded triangle wave: nearly always at ``speed`` per frame, so that few frames show no motion.
+    A rounded triangle wave: nearly always at ``speed`` per unit of time, so that few frames show no motion.
     """
     sharpness = 0.96
     rate = 0.5 * np.pi * speed / (amplitude * sharpness)
-    wave = np.sin(b.rng.uniform(0, 2 * np.pi) + rate * np.arange(b.frames))
+    wave = np.sin(b.rng.uniform(0, 2 * np.pi) + rate * b.time)
     return amplitude * np.arcsin(sharpness * wave) / np.arcsin(sharpness)
 
 
 def turning(b: Builder, speed: float) -> np.ndarray:
-    """``[T]``: an angle growing by ``speed`` (radians) per frame from a random start."""
-    return b.rng.uniform(0, 2 * np.pi) + speed * np.arange(b.frames)
+    """``[T]``: an angle growing by ``speed`` (radians) per unit of time from a random start."""
+    return b.rng.uniform(0, 2 * np.pi) + speed * b.time
 
 
 def path(x, y, z) -> np.ndarray:

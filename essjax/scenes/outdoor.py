@@ -191,7 +191,7 @@ def cuts(b: Builder) -> None:
     b.sun((0.5, 0.9, 0.4), (6.0, 5.6, 5.0))
     shots = []
     for k in range(4):
-        angle = rng.uniform(0, 2 * np.pi) + (1 if k % 2 else -1) * rng.uniform(0.03, 0.045) * np.arange(b.frames)
+        angle = rng.uniform(0, 2 * np.pi) + (1 if k % 2 else -1) * rng.uniform(0.03, 0.045) * b.time
         reach, height = rng.uniform(4.0, 7.0), rng.uniform(0.8, 3.0)
         eye = path(reach * np.sin(angle), height, reach * np.cos(angle))
         target = path(swing(b, 0.8, 0.03), rng.uniform(0.8, 1.8), swing(b, 0.8, 0.03))

@@ -73,7 +73,8 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
     def objective(variables: PyTree, clip: Sequence) -> dict[str, Array]:
         predicted = both_kinds(method, variables, clip, keep=lambda aux: aux.get("extrapolated", {}))[ESS]
         target = log1p(halve(rendered_color(clip.frames, "frnet")[1:-1]))
-        features, _ = network.apply(variables["frnet"], target, method="encode")
+        # The target's features are given: learned from this side too, they shrink until nothing differs.
+        features, _ = network.apply(jax.lax.stop_gradient(variables["frnet"]), target, method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted.features, features, strict=True)]
         return {
             "charbonnier": jnp.mean(charbonnier(predicted.half, target)),
@@ -119,7 +120,8 @@ def extrass_objective(
             if vgg_features is not None:
                 difference = perceptual(expm1(image), expm1(target), vgg_features)
                 terms[f"vgg_{kind}"] = vgg_weight * sum_of_means(difference)
-        levels = feature_l1(kinds[SS]["features"], kinds[ESS]["features"])
+        # E1 follows E0: drawn to each other, both shrink to zero (experiments/LOG.md).
+        levels = feature_l1(jax.lax.stop_gradient(kinds[SS]["features"]), kinds[ESS]["features"])
         terms["features"] = temporal_weight * sum_of_means(levels)
         return terms
 

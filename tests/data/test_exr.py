@@ -81,18 +81,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_all_parts_of_different_sizes_are_read(tmp_path):
-    path = tmp_path / "parts.exr"
-    window = (np.array([0, 0], np.int32), np.array([3, 2], np.int32))
-    parts = [
-        OpenEXR.Part({"displayWindow": window}, {name: np.full(shape, i, np.float32)}, name)
-        for i, (name, shape) in enumerate({"V.Depth.Z": (3, 4), "V.Mask.X": (6, 8)}.items())
-    ]
-    OpenEXR.File(parts).write(str(path))
-    back = exr.read(path, ["V.Mask.X"])
-    assert {name: plane.shape for name, plane in back.items()} == {"V.Depth.Z": (3, 4), "V.Mask.X": (6, 8)}
-
-
 def test_missing_channels_are_named(tmp_path):
     exr.write(tmp_path / "a.exr", planes()[1])
     with pytest.raises(ValueError, match=r"a\.exr: expected the channels depth\.Z, motion\.X; the file has color\.B, "):
