@@ -192,16 +192,14 @@ def _first_readable(
     """Which images the first readable frame of a sequence has, and its (width, height)."""
     error = None
     for text in digits.values():
+        paths = {image: source / fill(recipe.pattern(image), sequence, text) for image in ("color", *recipe.optional)}
         try:
-            color = exr.read(source / fill(recipe.pattern("color"), sequence, text), recipe.channels["color"])
+            files = {path: exr.read(path) for path in dict.fromkeys(paths.values()) if path.is_file()}
+            color = exr.read(paths["color"], recipe.channels["color"])[recipe.channels["color"][0]]
         except ValueError as problem:
             error = error or problem
             continue
-        height, width = color[recipe.channels["color"][0]].shape
+        there = {image for image, path in paths.items() if set(recipe.channels[image]) <= set(files.get(path, ()))}
         images = {image for image in recipe.channels if image not in ("reference", *recipe.optional)}
-        for image in recipe.optional:
-            path = source / fill(recipe.pattern(image), sequence, text)
-            if path.is_file() and set(recipe.channels[image]) <= set(exr.read(path)):
-                images.add(image)
-        return images, (width, height)
+        return images | there, (color.shape[1], color.shape[0])
     raise ValueError(f"sequence {sequence!r}: no frame can be read. The first: {error}")

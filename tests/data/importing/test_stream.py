@@ -150,6 +150,19 @@ def test_broken_and_missing_files_are_named(tmp_path):
         run("c")
 
 
+def test_a_broken_first_frame_does_not_decide_which_buffers_there_are(tmp_path):
+    write_extranet(tmp_path / "dump", truth(T=3), leave_out=("Specular",))
+    path = tmp_path / "dump" / "TempleRoughness.0001.exr"
+    path.write_bytes(path.read_bytes()[:200])
+    report = import_dataset(tmp_path / "dump", tmp_path / "out", "extranet", skip_broken=True)
+    assert report.sequence.numbers == (2, 3)
+    assert "roughness" in report.sequence.channels and "specular" not in report.sequence.channels
+    for path in (tmp_path / "dump").glob("*PreTonemap*"):
+        path.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"sequence 'Temple': no frame can be read\. The first: .*Color\.0001\.exr"):
+        import_dataset(tmp_path / "dump", tmp_path / "b", "extranet", skip_broken=True)
+
+
 def test_several_scenes_are_split_by_sequence(tmp_path):
     for seed, scene in enumerate(("Bunker", "Docks", "Temple", "Wood")):
         write_extranet(tmp_path / "dump", truth(T=2, seed=seed), scene)
