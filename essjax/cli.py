@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from essjax.data import PRESETS, Dataset, ImportReport, import_dataset
+from essjax.data import Dataset, ImportReport, import_dataset
 from essjax.generate import generate, plan
 
 _console = Console()
@@ -46,6 +46,11 @@ def parse_range(text: str, option: str) -> tuple[int, int]:
     if last < first:
         raise ValueError(f"{option}: expected FIRST:LAST such as 8:19, both included, got {text!r}.")
     return first, last
+
+
+def parse_split(text: str, option: str) -> tuple[int, int] | list[str]:
+    """``"8:19"`` as ``parse_range``; anything without a colon as names of sequences, separated by commas."""
+    return parse_range(text, option) if ":" in text else [name.strip() for name in text.split(",")]
 
 
 def _print_dataset(dataset: Dataset) -> None:
@@ -97,16 +102,32 @@ def scenes(
     _print_dataset(dataset)
 
 
+_COUNTS = {
+    "mixed": ("mixed silhouette pixels", "motion from cameras"),
+    "unwritten": ("pixels without a velocity", "motion from cameras"),
+    "negative": ("negative colour values", "set to 0"),
+    "infinite": ("infinite colour values", "clamped"),
+    "clamped": ("values beyond half's range", "clamped"),
+}
+
+
 def _print_report(report: ImportReport) -> None:
     _print_dataset(report.dataset)
     totals, table = report.totals, Table(title="conversion", title_justify="left", show_header=False)
-    table.add_row("frames", f"{report.sequence.numbers[0]}-{report.sequence.numbers[-1]}")
-    table.add_row("background", f"{totals['background'] / totals['pixels']:.1%} of pixels, masked; motion from cameras")
-    table.add_row("mixed silhouette pixels", f"{totals['mixed']}, motion from cameras")
-    table.add_row("negative colour values", f"{totals['negative']}, set to 0")
-    table.add_row("values beyond half's range", f"{totals['clamped']}, clamped")
-    table.add_row("objects that move", ", ".join(map(str, report.dynamic)) or "none found")
+    table.add_row("frames", str(sum(len(info.frames) for info in report.dataset.sequences.values())))
+    table.add_row("background", f"{totals['background'] / totals['pixels']:.1%} of pixels, masked")
+    for key, text in _COUNTS.items():
+        if key in totals:
+            table.add_row(text[0], f"{totals[key]}, {text[1]}")
+    if "dynamic" in report.sequence.source:
+        table.add_row("objects that move", ", ".join(map(str, report.dynamic)) or "none found")
+    if report.sequence.source.get("reference") == "color":
+        table.add_row("reference", "none in the dump: the colour itself, scale 1")
     _console.print(table)
+    for name, frames in report.skipped.items():
+        for number, reason in frames.items():
+            text = f"left out, a cut follows: {name}, frame {number}: {reason or 'broken in an earlier run'}"
+            _console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def import_(
@@ -114,28 +135,45 @@ def import_(
     out: tyro.conf.Positional[Path],
     /,
     preset: str = "blender",
+    recipe: Path | None = None,
+    reference: Path | None = None,
     train: str = "",
     validation: str = "",
     test: str = "",
     name: str = "",
+    skip_broken: bool = False,
 ) -> None:
     """Import rendered frames into a dataset, converting their conventions. Interrupted, the same command resumes.
+
+    docs/guides/importing.md has an example of every preset.
 
     Args:
       source: The folder as the renderer wrote it.
       out: The dataset's folder.
-      preset: The producer's conventions: blender.
-      train: First and last frame to train on, such as 8:19; all three ranges or none (60, 10 and 30 % in order).
-      validation: First and last frame to validate on, streamed from the clip's start.
-      test: First and last frame to test on, streamed from the clip's start.
-      name: Name of the sequence; the folder's if empty.
+      preset: The producer's conventions: blender, unreal, extranet, arm-nss or generic.
+      recipe: TOML that says a dump's files, channels and conventions, or changes a preset's; generic needs one.
+      reference: Folder with the references, named as the preset's colour, where the dump itself has none.
+      train: First and last frame to train on, such as 8:19, or names of sequences, such as a,b; give all three or none
+        (60, 10 and 30 % in order, of the sequences if there are three or more).
+      validation: The same, to validate on; streamed from the clip's start.
+      test: The same, to test on; streamed from the clip's start.
+      name: Name of the sequence; as in the dump if empty.
+      skip_broken: Leave out broken frames (the next one becomes a cut) instead of stopping at them.
     """
     given = {"train": train, "validation": validation, "test": test}
-    ranges = {split: parse_range(text, f"--{split}") for split, text in given.items() if text}
-    if preset not in PRESETS:
-        raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
+    splits = {split: parse_split(text, f"--{split}") for split, text in given.items() if text}
     with progress_bar("importing") as progress:
-        report = import_dataset(source, out, preset, splits=ranges or None, name=name or None, on_frame=progress)
+        report = import_dataset(
+            source,
+            out,
+            preset,
+            recipe=recipe,
+            reference=reference,
+            splits=splits or None,
+            name=name or None,
+            skip_broken=skip_broken,
+            on_frame=progress,
+        )
     _print_report(report)
 
 

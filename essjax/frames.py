@@ -21,6 +21,8 @@ from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree,
 class GBuffers:
     """What the rasteriser knows without shading, at the jittered sample positions.
 
+    Only depth is always there: a method names what else it needs in ``MethodInfo.requires``.
+
     Attributes:
       base_color: ``[..., H, W, 3]`` in [0, 1]; 0 on the sky.
       normal: ``[..., H, W, 3]`` world space, unit length; zero vector where nothing was hit.
@@ -33,8 +35,8 @@ class GBuffers:
       n_dot_v: ``[..., H, W, 1]`` in [0, 1]: cosine between normal and direction to the camera.
     """
 
-    base_color: Color
-    normal: Vectors
+    base_color: Color | None = None
+    normal: Vectors | None = None
     depth: Plane
     roughness: Plane | None = None
     metallic: Plane | None = None
@@ -112,7 +114,20 @@ class Prediction:
     state: dict[str, PyTree] = dataclasses.field(default_factory=dict)
 
 
-OPTIONAL_GBUFFERS = ("roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v")
+OPTIONAL_GBUFFERS = (
+    "base_color", "normal", "roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v",
+)  # fmt: skip
+PURPOSES = {
+    "base_color": "divides the texture out of the shading and guides the warp",
+    "normal": "tells surfaces apart: guides the warp",
+    "roughness": "tells mirrors from matt surfaces",
+    "metallic": "belongs to the divisor of the shading",
+    "specular": "belongs to the divisor of the shading",
+    "world_position": "finds holes on static surfaces",
+    "stencil": "tells moving objects apart",
+    "n_dot_v": "finds holes at grazing angles",
+}
+"""What a method wants a buffer for: the reason that ``require`` gives."""
 CHANNELS = {
     "color": 3, "base_color": 3, "normal": 3, "depth": 1, "roughness": 1, "metallic": 1, "specular": 1,
     "world_position": 3, "stencil": 1, "n_dot_v": 1, "motion": 2, "reactive": 1,
@@ -131,10 +146,17 @@ def gbuffers_of(images: Mapping[str, Any]) -> GBuffers:
     """G-buffers picked by name from ``images``, which may hold more; optional ones that are absent become None.
 
     Raises:
-      KeyError: base colour, normal or depth is missing.
+      KeyError: depth is missing.
     """
-    optional = {name: images.get(name) for name in OPTIONAL_GBUFFERS}
-    return GBuffers(base_color=images["base_color"], normal=images["normal"], depth=images["depth"], **optional)
+    return GBuffers(depth=images["depth"], **{name: images.get(name) for name in OPTIONAL_GBUFFERS})
+
+
+def surface_guides(gbuffers: GBuffers) -> tuple[Color, Vectors]:
+    """Base colour and normal; a ValueError that says which one is missing."""
+    if gbuffers.base_color is None or gbuffers.normal is None:
+        missing = [name for name in ("base_color", "normal") if getattr(gbuffers, name) is None]
+        raise ValueError(f"guided warps need the buffers {', '.join(missing)}, which these frames do not have.")
+    return gbuffers.base_color, gbuffers.normal
 
 
 def rendered_color(frame: Frame, name: str) -> Color:
@@ -145,13 +167,14 @@ def rendered_color(frame: Frame, name: str) -> Color:
 
 
 def require(frame: Frame, names: Iterable[str], method: str) -> None:
-    """Raise a ValueError that names the buffers which ``method`` needs and ``frame`` lacks (``color`` included)."""
+    """Raise a ValueError that names the buffers which ``method`` needs and ``frame`` lacks, and why it needs them."""
     present = frame_images(frame)
     missing = [name for name in names if name not in present]
     if missing:
+        why = "".join(f" {name} {PURPOSES[name]}." for name in missing if name in PURPOSES)
         raise ValueError(
             f"{method} needs the buffers {', '.join(missing)}, which these frames do not have "
-            f"(they have {', '.join(present)}). Render or import them, or choose another method."
+            f"(they have {', '.join(present)}).{why} Render or import them, or choose another method."
         )
 
 

@@ -36,7 +36,30 @@ def keep(metrics_path: Path, name: str | None = None) -> Path:
 
 def page(results: list[tuple[str, dict[str, Any]]]) -> str:
     """The whole page."""
-    return "\n".join([HEAD, *(_section(name, metrics) for name, metrics in results)])
+    sections = {"import": _import_section}
+    return "\n".join(
+        [HEAD, *(sections.get(metrics.get("kind", ""), _section)(name, metrics) for name, metrics in results)]
+    )
+
+
+def _import_section(name: str, metrics: dict[str, Any]) -> str:
+    """Speed and memory of ``essjax import`` (experiments/import_benchmark.py)."""
+    lines = [
+        f"## {name}",
+        "",
+        f"`python -m experiments.import_benchmark`; {metrics['machine']}. Memory: of the process, after a tenth of the "
+        "frames and at the end.",
+        "",
+        "| frames | count | frames per second | CPU seconds per frame | MB per frame on disk | memory, MB |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for case, values in metrics["cases"].items():
+        memory, speed = values["resident_megabytes"], values["frames_per_second"]
+        lines.append(
+            f"| {case} | {values['frames']} | {speed:.1f} | {values['cpu_seconds_per_frame']:.3f} | "
+            f"{values['megabytes_per_frame']:.1f} | {memory[len(memory) // 10]:.0f}, {memory[-1]:.0f} |"
+        )
+    return "\n".join([*lines, ""])
 
 
 def _section(name: str, metrics: dict[str, Any]) -> str:

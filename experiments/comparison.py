@@ -7,12 +7,13 @@ from pathlib import Path
 import jax
 
 from essjax.data import Dataset
-from essjax.frames import select_time
+from essjax.frames import Sequence, frame_images, select_time
+from essjax.interfaces import Method
 from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.evaluate import Clip, Runner
 from experiments.tuning import Setting, setting_variables, tune
-from experiments.variants import PARTS, REFERENCES, VARIANTS, compared
+from experiments.variants import BASELINES, PARTS, REFERENCES, VARIANTS, compared
 
 
 def make_runners(
@@ -30,9 +31,13 @@ def make_runners(
     native = validation[0].sequence.native is not None
     runners, settings = {}, {}
     kept = _read_settings(out / "tuning.json")
+    frames = select_time(validation[0].sequence.frames, 0)
     for row in compared(name):
         variant = VARIANTS[row]
         if row == "taa" and not native:
+            continue
+        method = variant.method(config)
+        if row != name and unfit(method, validation[0].sequence):
             continue
         if variant.tuned and config.tune:
             if row not in kept:
@@ -42,18 +47,25 @@ def make_runners(
             method = variant.method(config, clamp=kept[row].clamp)
             runners[row] = Runner(method, setting_variables(kept[row]), config.compiler_options)
         elif variant.tuned:
-            method = variant.method(config)
-            example = select_time(validation[0].sequence.frames, 0)
-            runners[row] = Runner(method, method.init(jax.random.key(0), example), config.compiler_options)
+            runners[row] = Runner(method, method.init(jax.random.key(0), frames), config.compiler_options)
         elif row in (name, *PARTS.get(name, ())):
-            method = variant.method(config)
             entries = [stage.name for stage in variant.stages(config)]
             runners[row] = Runner(method, {entry: variables[entry] for entry in entries}, config.compiler_options)
         else:
-            runners[row] = Runner(variant.method(config), {}, config.compiler_options)
+            runners[row] = Runner(method, {}, config.compiler_options)
     content = {row: setting._asdict() for row, setting in settings.items()}
     (out / "tuning.json").write_text(json.dumps(content, indent=1) + "\n")
     return runners, settings
+
+
+def unfit(method: Method, sequence: Sequence) -> str:
+    """Why ``method`` cannot be run and scored on ``sequence``, or an empty string."""
+    missing = sorted(method.info.requires - set(frame_images(sequence.frames)))
+    if missing:
+        return f"this dataset has no {', '.join(missing)}"
+    if method.info.scale not in (1, sequence.scale):
+        return f"it enlarges {method.info.scale:g} times, this dataset's reference is {sequence.scale} times larger"
+    return ""
 
 
 def _read_settings(path: Path) -> dict[str, Setting]:
@@ -65,6 +77,12 @@ def _read_settings(path: Path) -> dict[str, Setting]:
 def table_references() -> dict[str, str]:
     """Rows that are not on equal terms, and why."""
     return dict(REFERENCES)
+
+
+def _left_out(sequence: Sequence, config: Config) -> list[str]:
+    """One remark per baseline that does not fit the data."""
+    reasons = {row: unfit(VARIANTS[row].method(config), sequence) for row in BASELINES}
+    return [f"No {row} row: {reason}." for row, reason in reasons.items() if reason]
 
 
 def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], config: Config) -> list[str]:
@@ -81,6 +99,7 @@ def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], con
     for row, setting in settings.items():
         chosen = f"alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}"
         remarks.append(f"{row}: {chosen}, the best on the validation frames ({setting.psnr:.2f} dB there).")
+    remarks += _left_out(clips[0].sequence, config)
     if clips[0].sequence.native is None:
         remarks.append("No taa row: this dataset has no colour at native resolution.")
     if not clips[0].exact_holes:

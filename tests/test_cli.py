@@ -12,7 +12,9 @@ from essjax.data import clips, read_dataset, read_sequence
 from essjax.frames import select_time, validate_sequence
 from essjax.generate import Clip, generate, live_source, plan
 from essjax.scenes import TEST_ONLY_FAMILIES, TRAIN_FAMILIES
-from tests.data.test_presets import dump  # noqa: F401 (fixture)
+from tests.data.importing.dumps import truth
+from tests.data.importing.test_blender import dump  # noqa: F401 (fixture)
+from tests.data.importing.test_presets import write_extranet
 from tests.helpers import make_sequence
 
 
@@ -128,10 +130,31 @@ def test_import_command_prints_what_it_did(tmp_path, capsys, dump):  # noqa: F81
         "--test", "12:13",
     )  # fmt: skip
     assert code == 0
-    for text in ("20x12 -> x2", "25.0% of pixels, masked", "negative colour values │ 6, set to 0", "move │ 7", "8-13"):
+    for text in (
+        "20x12 -> x2",
+        "25.0% of pixels, masked",
+        "negative colour values │ 6, set to 0",
+        "move │ 7",
+        "frames │ 6",
+    ):
         assert text in output
     splits = read_dataset(tmp_path / "out").splits
     assert splits["validation"] == (("clip", 8, 11, 11),) and splits["test"] == (("clip", 8, 13, 12),)
+
+
+def test_import_command_of_a_dump_with_a_broken_frame(tmp_path, capsys):
+    known = truth(T=12)
+    write_extranet(tmp_path / "dump", known, reference=tmp_path / "hr")
+    path = tmp_path / "dump" / "TempleMotionVector.0005.exr"
+    path.write_bytes(path.read_bytes()[:400])
+    arguments = ["import", tmp_path / "dump", tmp_path / "out", "--preset", "extranet", "--reference", tmp_path / "hr"]
+    code, output = run(capsys, *arguments)
+    assert code == 2 and "sequence Temple, frame 5: " in output and "--skip-broken" in output
+    code, output = run(capsys, *arguments, "--skip-broken")
+    assert code == 0 and "left out, a cut follows: Temple, frame 5: " in output and "frames │ 11" in output
+    assert read_dataset(tmp_path / "out").source["skipped"] == {"Temple": [5]}
+    code, output = run(capsys, "import", tmp_path / "dump", tmp_path / "b", "--preset", "generic")
+    assert code == 2 and "error: the preset generic needs a recipe" in output
 
 
 def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
@@ -141,8 +164,12 @@ def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
         (["scenes", out, "--size", "0x4"], "error: --size: expected WIDTHxHEIGHT such as 128x72, got '0x4'."),
         (["scenes", out, "--families", "gloss,glas"], "got 'glas'."),
         (["import", tmp_path / "nothing", out], "meta.json: not found."),
-        (["import", dump, out, "--preset", "unreal"], "error: --preset: expected one of blender, got 'unreal'."),
-        (["import", dump, out, "--train", "9-12"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
+        (
+            ["import", dump, out, "--preset", "maya"],
+            "error: preset: expected one of blender, unreal, extranet, arm-nss, generic, got",
+        ),
+        (["import", dump, out, "--train", "9:x"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
+        (["import", dump, out, "--train", "9-12"], "error: train: there is no sequence '9-12'; there are clip."),
         (
             ["import", dump, out, "--train", "8:20"],
             "error: train: expected first <= last within the frames 8..13, got 8..20.",

@@ -1,9 +1,9 @@
 """Datasets on disk, import of renders, and the loader. Files: ``layout``; conventions: docs/conventions.md."""
 
 from essjax.data.augment import crop, flip, start_with_cut
+from essjax.data.importing import PRESETS, ImportReport, import_dataset
 from essjax.data.layout import Dataset, Segment, SequenceInfo, read_dataset, write_dataset
 from essjax.data.loader import CachedSource, Source, clips, disk_source
-from essjax.data.presets import PRESETS, ImportReport, import_dataset
 from essjax.data.store import SequenceWriter, read_segment, read_sequence, write_sequence
 
 __all__ = [

@@ -214,6 +214,9 @@ def _encode(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, int]
         return np.ascontiguousarray(values, np.uint32), 0
     if not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"{path}, channel {name}: expected float or integer values, got {values.dtype}.")
+    low, high = values.min(), values.max()  # NaN if there is one
+    if np.isfinite(low) and np.isfinite(high) and max(-low, high) <= HALF_MAX:  # nearly always: nothing to look for
+        return np.ascontiguousarray(values, np.float32 if layer(name) in FULL_PRECISION else np.float16), 0
     allowed = np.isfinite(values) | ((values == np.inf) & (layer(name) == "depth"))
     if not allowed.all():
         raise ValueError(

@@ -6,10 +6,11 @@ import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import OpenEXR
 
 from essjax.cameras import Camera
 from essjax.data import exr
@@ -30,6 +31,8 @@ from essjax.data.layout import (
 from essjax.frames import Frame, Sequence, frame_images, gbuffers_of, select_time, validate_frame
 
 MASKS = ("valid", "steady")
+FAST = {"compression": OpenEXR.RLE_COMPRESSION}
+"""Lossless in a third of ZIP's time, for about a quarter more disk (path-traced frames): an import is bound by it."""
 
 
 def _plain(content: Any) -> Any:
@@ -63,6 +66,20 @@ def _planes(images: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {
         key: plane for name, image in images.items() for key, plane in split_planes(name, np.asarray(image)).items()
     }
+
+
+class PreparedFrame(NamedTuple):
+    """A frame whose images are on disk, but which the sequence does not list yet.
+
+    Attributes:
+      number: original frame number.
+      described: what a sequence of such frames looks like.
+      record: its entry in ``sequence.json``.
+    """
+
+    number: int
+    described: SequenceInfo
+    record: Mapping[str, Any]
 
 
 class SequenceWriter:
@@ -168,24 +185,75 @@ class SequenceWriter:
         """
         if number in self:
             return
+        masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
         frame, reference, native = jax.tree.map(np.asarray, (frame, reference, native))
+        self._validate(number, frame, reference, native)
+        self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
+        self.commit(self._write_images(number, frame, reference, masks, native, notes or {}))
+
+    def prepare(
+        self, number: int, frame: Frame, reference: Any, *, notes: Mapping[str, Any] | None = None
+    ) -> PreparedFrame:
+        """The first half of ``write``: check a frame and write its images. Threads may prepare frames side by side.
+
+        Raises:
+          ValueError: invalid content.
+        """
+        frame, reference = jax.tree.map(np.asarray, (frame, reference))
+        self._validate(number, frame, reference, None)
+        return self._write_images(number, frame, reference, {}, None, notes or {})
+
+    def commit(self, prepared: PreparedFrame, *, cut: bool = False, save: bool = True) -> None:
+        """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
+
+        Args:
+          prepared: from ``prepare``.
+          cut: the frame is a cut, whatever it says itself: the frame before it was left out.
+          save: write ``sequence.json`` now. It grows with the frames, so a long import saves only now and then.
+
+        Raises:
+          ValueError: it does not fit to the frames before. Its images are removed.
+        """
+        cut = cut or prepared.record["cut"]
+        try:
+            info = self._check_next(prepared.number, prepared.described, cut)
+        except ValueError:
+            self.discard(prepared.number)
+            raise
+        self.info = dataclasses.replace(info, frames=(*info.frames, {**prepared.record, "cut": cut}))
+        if save:
+            self.save()
+
+    def save(self) -> None:
+        """Write ``sequence.json``, if there is a frame."""
+        if self.info is not None:
+            write_sequence_info(self.root, self.info)
+
+    def discard(self, number: int) -> None:
+        """Remove the images of a frame that is not listed."""
+        for kind in ("lr", "hr", "native"):
+            self._path(kind, number).unlink(missing_ok=True)
+
+    def _validate(self, number: int, frame: Frame, reference: np.ndarray, native: Frame | None) -> None:
         where = f"sequence {self.name}, frame {number}"
         validate_frame(frame, where, ("color",))
         if native is not None:
             validate_frame(native, f"{where}, native", ("color",))
         if not (np.isfinite(reference).all() and reference.min() >= 0):
             raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
-        masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
-        info = self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
+
+    def _write_images(
+        self, number: int, frame: Frame, reference: np.ndarray, masks: Mapping, native: Frame | None, notes: Mapping
+    ) -> PreparedFrame:
+        described = self._describe(frame, reference, masks, native)
         (self.root / self.name).mkdir(parents=True, exist_ok=True)
-        clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}))
+        clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}), attributes=FAST)
         hr = {name: reference[..., i] for i, name in enumerate("RGB")}
-        clamped += exr.write(self._path("hr", number), hr)
+        clamped += exr.write(self._path("hr", number), hr, attributes=FAST)
         if native is not None:
-            clamped += exr.write(self._path("native", number), _planes(frame_images(native)))
-        record = _plain({**_frame_record(number, frame, native), "notes": {**(notes or {}), "clamped": clamped}})
-        self.info = dataclasses.replace(info, frames=(*info.frames, record))
-        write_sequence_info(self.root, self.info)
+            clamped += exr.write(self._path("native", number), _planes(frame_images(native)), attributes=FAST)
+        record = _plain({**_frame_record(number, frame, native), "notes": {**notes, "clamped": clamped}})
+        return PreparedFrame(number, described, record)
 
     def _path(self, kind: str, number: int) -> Path:
         return frame_path(self.root, self.name, kind, number)
@@ -196,7 +264,7 @@ class SequenceWriter:
             raise ValueError(f"{self.root / self.name}: expected at least one frame before finish().")
         if not self.info.complete:
             self.info = dataclasses.replace(self.info, complete=True)
-            write_sequence_info(self.root, self.info)
+            self.save()
         return self.info
 
 

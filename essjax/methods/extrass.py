@@ -9,9 +9,19 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import expm1, log1p, rgb_to_ycocg, ycocg_to_rgb
-from essjax.frames import Frame, GBuffers, Prediction, depth_scale, network_depth, rendered_color, select_time
+from essjax.frames import (
+    Frame,
+    GBuffers,
+    Prediction,
+    depth_scale,
+    network_depth,
+    rendered_color,
+    require,
+    select_time,
+    surface_guides,
+)
 from essjax.interfaces import Method, MethodInfo, Network, no_variables, reset_at_cut
-from essjax.methods.rendered import RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
+from essjax.methods.rendered import GUIDED, RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
 from essjax.methods.taau import Resampled, gaussian_resample
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
@@ -55,7 +65,7 @@ def extrass_w(
         image = guided_extrapolation(newest, frame, sigma_guide=sigma_guide, sigma_distance=sigma_distance)
         return history, Prediction(image=image, aux={"warp": image})
 
-    info = MethodInfo("extrass-w", scale=1, predicts=frozenset({"ess"}))
+    info = MethodInfo("extrass-w", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
     return Method(no_variables, start_pair, render_step, extrapolate_step, info)
 
 
@@ -94,7 +104,7 @@ def refine(network: Network, variables: PyTree, warped: Color, gbuffers: GBuffer
 
 def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: float = REFINE_DELTA) -> Mask:
     """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear)."""
-    base, normal = gbuffers.base_color, gbuffers.normal
+    base, normal = surface_guides(gbuffers)
     base_half, normal_half = _enlarge(halve(base), base), _enlarge(halve(normal), normal)
     distance = jnp.linalg.norm(base_half - base, axis=-1, keepdims=True) / jnp.sqrt(3.0)
     similar = (1.0 - distance) * jnp.sum(normal_half * normal, axis=-1, keepdims=True) > delta
@@ -135,7 +145,7 @@ def _extrapolate(network: Network, variables: PyTree, pair: RenderedPair, frame:
 
 
 def _frnet_inputs(example: Frame) -> tuple[Image, Image]:
-    half = halve(jnp.zeros_like(example.gbuffers.base_color))
+    half = halve(jnp.zeros((*example.motion.shape[:-1], 3)))
     return jnp.stack([half, half]), half[..., :1]
 
 
@@ -158,6 +168,7 @@ def extrass_e(
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
     def init(key, example):
+        require(example, sorted(GUIDED), info.name)
         return {"frnet": network.init(key, *_frnet_inputs(example))}
 
     def render_step(variables, history, frame, *, train=False):
@@ -168,7 +179,7 @@ def extrass_e(
         result = _extrapolate(network, variables["frnet"], history, frame, sigmas)
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
-    info = MethodInfo("extrass-e", scale=1, predicts=frozenset({"ess"}))
+    info = MethodInfo("extrass-e", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
     return Method(init, start_pair, render_step, extrapolate_step, info)
 
 
@@ -282,7 +293,7 @@ def extrass(
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
     def start(example: Frame) -> History:
-        image = nearest_upsample(jnp.zeros_like(example.gbuffers.base_color), scale)
+        image = nearest_upsample(jnp.zeros((*example.motion.shape[:-1], 3)), scale)
         return History(
             rendered=start_pair(example),
             image=image,
@@ -301,10 +312,11 @@ def extrass(
         return dataclasses.replace(rest, rendered=rendered)
 
     def init(key, example):
+        require(example, sorted(GUIDED), info.name)
         key_flow, key_net = jax.random.split(key)
 
         def both_inputs(example):
-            history, color = start(example), jnp.zeros_like(example.gbuffers.base_color)
+            history, color = start(example), jnp.zeros((*example.motion.shape[:-1], 3))
             warped = warp_history(history, example, scale)
             return [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
 
@@ -315,7 +327,7 @@ def extrass(
         }
 
     def _extras(frame: Frame, warp: Color) -> tuple[list[Image], list[Image]]:
-        return [], [log1p(warp), frame.gbuffers.base_color]
+        return [], [log1p(warp), surface_guides(frame.gbuffers)[0]]
 
     def _inputs(frame: Frame, history: History, warped: Warped, color: Color, extra: list[Image]):
         """Inputs of E0 or E1 at LR, and the LR colour (log1p) resampled to the HR grid."""
@@ -369,5 +381,5 @@ def extrass(
         aux = {"log_image": log_image, "warped": warped, "features": features, "extrapolated": low}
         return history, Prediction(image=image, aux=aux)
 
-    info = MethodInfo("extrass", scale=scale)
+    info = MethodInfo("extrass", scale=scale, requires=GUIDED)
     return Method(init, start, render_step, extrapolate_step, info)

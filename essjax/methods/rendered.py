@@ -6,10 +6,13 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import demodulate, demodulation_albedo, modulate
-from essjax.frames import Frame, GBuffers, background, rendered_color
+from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
 from essjax.interfaces import expand_flag, reset_at_cut
 from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, pytree
 from essjax.warp import compose_motion, gbuffer_guided_warp, guides, jittered_motion
+
+GUIDED = frozenset({"base_color", "normal"})
+"""``MethodInfo.requires`` of every method that warps guided by G-buffers."""
 
 
 @pytree
@@ -48,7 +51,8 @@ class RenderedPair:
 
 def albedo(gbuffers: GBuffers) -> Color:
     """The demodulation divisor of these G-buffers."""
-    return demodulation_albedo(gbuffers.base_color, background(gbuffers), gbuffers.metallic, gbuffers.specular)
+    base_color, _ = surface_guides(gbuffers)
+    return demodulation_albedo(base_color, background(gbuffers), gbuffers.metallic, gbuffers.specular)
 
 
 def _remember(frame: Frame) -> Rendered:
@@ -64,7 +68,7 @@ def _remember(frame: Frame) -> Rendered:
 
 def start_pair(example: Frame) -> RenderedPair:
     """A memory of nothing, with the shapes of ``example`` (whose colour may be None)."""
-    empty = _remember(dataclasses.replace(example, color=jnp.zeros_like(example.gbuffers.base_color)))
+    empty = _remember(dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3))))
     count = jnp.zeros(example.cut.shape, jnp.int32)
     return RenderedPair(frames=jax.tree.map(_twice, empty), count=count, jitter=jnp.copy(example.jitter))
 

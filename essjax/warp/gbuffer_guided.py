@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.cameras import pixel_positions
-from essjax.frames import GBuffers
+from essjax.frames import GBuffers, surface_guides
 from essjax.typing import Array, Image, Motion
 from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.sampling import gather_pixels
@@ -37,7 +37,7 @@ def candidate_offsets() -> np.ndarray:
 
 def guides(gbuffers: GBuffers) -> Image:
     """The guide of eq 2: base colour and normal, ``[..., H, W, 6]``."""
-    return jnp.concatenate([gbuffers.base_color, gbuffers.normal], axis=-1)
+    return jnp.concatenate(surface_guides(gbuffers), axis=-1)
 
 
 def _select(guide_previous: Array, guide: Array, x: Array, y: Array, inverse: Array) -> tuple[Array, ...]:

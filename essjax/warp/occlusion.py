@@ -46,8 +46,10 @@ def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
     return jnp.where((hole < 0.5) & (found[..., 2:] > 0), found[..., :2], motion)
 
 
-def _agreement(a: Array, b: Array) -> Array:
-    """Cosine between two normals; 1 where one of them is missing (zero vector)."""
+def _agreement(a: Array | None, b: Array | None) -> Array:
+    """Cosine between two normals; 1 where one of them is missing (no buffer, zero vector)."""
+    if a is None or b is None:
+        return jnp.ones(())
     lengths = jnp.sqrt(jnp.sum(a * a, -1, keepdims=True) * jnp.sum(b * b, -1, keepdims=True))
     return jnp.where(lengths > 1e-6, jnp.sum(a * b, -1, keepdims=True) / jnp.maximum(lengths, 1e-6), 1.0)
 
@@ -96,8 +98,8 @@ def hole_mask(
 
     Absent channels: without ``n_dot_v`` it counts as 0.25; without ``stencil`` everything counts as static; without
     ``world_position`` static pixels are compared by normal and by depth (relatively) instead - that of
-    the two frames, so a fast camera along its axis needs a larger ``depth_threshold``. Normals that are zero
-    agree with all.
+    the two frames, so a fast camera along its axis needs a larger ``depth_threshold``. Normals that are zero or
+    absent agree with all: depth alone decides then.
 
     Args:
       current: ``[..., H, W, C]`` each.

@@ -109,10 +109,10 @@ def test_a_write_that_dies_between_two_images_leaves_the_frame_incomplete(tmp_pa
     write_frames(writer, source, [0], 0)
     real = exr.write
 
-    def dies_at_reference(path, channels):
+    def dies_at_reference(path, channels, **options):
         if path.name == "hr.0001.exr":
             raise KeyboardInterrupt
-        return real(path, channels)
+        return real(path, channels, **options)
 
     monkeypatch.setattr(exr, "write", dies_at_reference)
     with pytest.raises(KeyboardInterrupt):

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from experiments import benchmarks_page
+from experiments import benchmarks_page, import_benchmark
 
 
 def test_the_page_is_current():
@@ -27,3 +27,15 @@ def test_a_result_becomes_a_table(tmp_path, monkeypatch):
     source.write_text(json.dumps({**metrics, "schema": 2}))
     with pytest.raises(ValueError, match="expected schema 1, got 2"):
         benchmarks_page.keep(source)
+
+
+def test_the_import_benchmark_measures_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.setattr(import_benchmark, "WIDTH", 48)
+    monkeypatch.setattr(import_benchmark, "HEIGHT", 28)
+    import_benchmark.make_dump(tmp_path, 52)
+    measured = import_benchmark.measure(tmp_path, 52, with_reference=True, workers=2)
+    assert measured["frames"] == 52 and len(measured["resident_megabytes"]) == 2
+    assert measured["cpu_seconds_per_frame"] > 0 and 50 < measured["resident_megabytes"][0] < 5000
+    text = benchmarks_page.page([("import", {"kind": "import", "machine": "2 cores", "cases": {"small": measured}})])
+    assert f"| small | 52 | {measured['frames_per_second']:.1f} |" in text
+    assert not (tmp_path / "out").exists()

@@ -9,14 +9,14 @@ import pytest
 
 from essjax import warp
 from essjax.data import import_dataset, read_dataset, read_segment, read_sequence
-from essjax.data.presets import default_splits
+from essjax.data.importing.splits import default_splits
 from essjax.frames import select_time, validate_sequence
 
 W, H, FIRST, LAST = 20, 12, 8, 13
 LENS, SENSOR = 30.0, 36.0
 FOCAL = LENS / SENSOR * W
 OWN_MOTION = np.array([1.5, -0.5])  # (x right, y down) of object 7, besides the camera's
-CHESS = Path(__file__).parents[3] / "shared" / "data" / "chess_blender"
+CHESS = Path(__file__).parents[4] / "shared" / "data" / "chess_blender"
 
 
 def camera_to_world(number):
@@ -240,8 +240,10 @@ def test_a_gap_in_the_numbers_is_a_cut(tmp_path):
 
 def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
     run = lambda: import_dataset(dump, tmp_path / "out", "blender")
-    with pytest.raises(ValueError, match="preset: expected one of blender, got 'unreal'"):
-        import_dataset(dump, tmp_path / "out", "unreal")
+    with pytest.raises(
+        ValueError, match="preset: expected one of blender, unreal, extranet, arm-nss, generic, got 'maya'"
+    ):
+        import_dataset(dump, tmp_path / "out", "maya")
     (dump / "hr.0010.exr").rename(dump / "gone.exr")
     with pytest.raises(
         ValueError, match=r"1 of the 12 images that meta\.json lists are missing, the first is hr\.0010"

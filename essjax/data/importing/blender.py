@@ -1,25 +1,27 @@
-"""Import of renders: one named preset per producer converts its conventions to essjax's, once.
-
-``blender``: a folder with ``meta.json`` and, per frame, ``lr.NNNN.exr`` (jittered colour and passes) and
+"""``blender``: a folder with ``meta.json`` and, per frame, ``lr.NNNN.exr`` (jittered colour and passes) and
 ``hr.NNNN.exr`` (reference), as Blender writes multi-layer EXR.
+
+Code instead of a recipe, because of what Blender leaves out: the background's motion, which objects move by themselves,
+and averaged passes at silhouettes.
 """
 
 import dataclasses
-import os
-from collections.abc import Callable, Iterable, Mapping
+import functools
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.cameras import Camera, pixel_positions, static_motion, unproject
+from essjax.cameras import Camera, pixel_positions, unproject
 from essjax.data import exr
-from essjax.data.layout import Dataset, Segment, SequenceInfo, read_json, write_dataset
-from essjax.data.store import SequenceWriter
+from essjax.data.importing.dump import camera_motion
+from essjax.data.importing.facts import make_camera
+from essjax.data.importing.stream import Converted
+from essjax.data.layout import read_json
 from essjax.frames import Frame, GBuffers
-from essjax.typing import Jitter, Motion, Plane
 
 BLENDER_BACKGROUND = 1e9
 """Blender writes 1e10 as the depth of the background."""
@@ -31,25 +33,6 @@ DYNAMIC_SHARE = 0.1
 """... in more than this share of its pixels."""
 DYNAMIC_AREA = 16
 """Frames in which an object has fewer pixels than this do not count."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportReport:
-    """What an import found and did.
-
-    Attributes:
-      dataset: the dataset that was written.
-      sequence: its only sequence.
-      dynamic: object ids that move by themselves; others became stencil 0.
-      totals: counts over all frames: ``pixels`` (LR), ``background`` pixels, ``mixed`` silhouette pixels of static
-        objects whose motion was taken from the cameras, ``negative`` colour values set to 0, ``clamped`` values beyond
-        half's range.
-    """
-
-    dataset: Dataset
-    sequence: SequenceInfo
-    dynamic: tuple[int, ...]
-    totals: Mapping[str, int]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,11 +53,7 @@ class _Dump:
 
 def _blender_camera(record: Mapping, width: int, height: int) -> Camera:
     focal = record["lens_mm"] / record["sensor_width_mm"] * width
-    return Camera(
-        camera_to_world=np.asarray(record["camera_to_world"], np.float32).reshape(4, 4),
-        focal=np.asarray([focal, focal], np.float32),
-        center=np.asarray([width / 2, height / 2], np.float32),
-    )
+    return make_camera(record["camera_to_world"], [focal, focal], [width / 2, height / 2])
 
 
 def _read_meta(folder: Path) -> _Dump:
@@ -111,14 +90,6 @@ def _check_files(dump: _Dump) -> None:
             f"{dump.folder}: {len(missing)} of the {len(paths)} images that meta.json lists are missing, the first is "
             f"{missing[0]}. Render or copy them, or take their frames out of meta.json."
         )
-
-
-def _check_ranges(ranges: Mapping[str, tuple[int, int]], numbers: list[int]) -> None:
-    for split, (first, last) in ranges.items():
-        if not numbers[0] <= first <= last <= numbers[-1]:
-            raise ValueError(
-                f"{split}: expected first <= last within the frames {numbers[0]}..{numbers[-1]}, got {first}..{last}."
-            )
 
 
 class _Passes:
@@ -164,19 +135,13 @@ def _lr(dump: _Dump, number: int) -> _Passes:
     return _Passes(dump.folder / f"lr.{number:04d}.exr", dump.width, dump.height)
 
 
-@jax.jit
-def _static_motion(camera: Camera, previous: Camera, jitter: Jitter, depth: Plane) -> Motion:
-    height, width = depth.shape[:2]
-    return static_motion(camera, previous, pixel_positions(height, width, jitter), depth)
-
-
 def _motions(dump: _Dump, passes: _Passes, number: int, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Motion as rendered, ``previous = current + (X, -Y)``, and that of a static world; both 0 in the first frame."""
     vector = passes.get("Vector", "XY") * np.array([1.0, -1.0], np.float32)
     if number - 1 not in dump.cameras:
         return np.zeros_like(vector), np.zeros_like(vector)
     camera, previous = dump.cameras[number], dump.cameras[number - 1]
-    return vector, np.asarray(_static_motion(camera, previous, dump.jitters[number], depth))
+    return vector, np.asarray(camera_motion(camera, previous, dump.jitters[number], depth))
 
 
 def _depth(passes: _Passes) -> np.ndarray:
@@ -192,22 +157,31 @@ def _object_index(passes: _Passes) -> np.ndarray | None:
     return None
 
 
-def _dynamic_ids(dump: _Dump) -> tuple[int, ...]:
-    """Ids of objects whose rendered motion is not that of a static surface under the camera's motion."""
-    dynamic: set[int] = set()
-    for number in dump.numbers:
-        passes = _lr(dump, number)
-        index, depth = _object_index(passes), _depth(passes)
-        if index is None:
-            return ()
-        vector, static = _motions(dump, passes, number, depth)
-        moving = np.linalg.norm(vector - static, axis=-1) > DYNAMIC_PIXELS
-        hit = np.isfinite(depth[..., 0])
-        for identity in np.unique(index[hit]):
-            mine = moving[hit & (index[..., 0] == identity)]
-            if mine.size >= DYNAMIC_AREA and mine.mean() > DYNAMIC_SHARE:
-                dynamic.add(int(identity))
-    return tuple(sorted(dynamic))
+def _moving_ids(dump: _Dump, number: int) -> set[int]:
+    """Ids of objects whose rendered motion in a frame is not that of a static surface under the camera's motion."""
+    passes = _lr(dump, number)
+    index, depth = _object_index(passes), _depth(passes)
+    if index is None:
+        return set()
+    vector, static = _motions(dump, passes, number, depth)
+    moving, hit = np.linalg.norm(vector - static, axis=-1) > DYNAMIC_PIXELS, np.isfinite(depth[..., 0])
+    objects = {int(identity): moving[hit & (index[..., 0] == identity)] for identity in np.unique(index[hit])}
+    return {identity for identity, mine in objects.items() if mine.size >= DYNAMIC_AREA and mine.mean() > DYNAMIC_SHARE}
+
+
+def _dynamic_ids(dump: _Dump, workers: int | None, skip_broken: bool) -> tuple[int, ...]:
+    """Ids of objects that move in some frame; broken frames count as still if they are to be skipped."""
+
+    def ids(number: int) -> set[int]:
+        try:
+            return _moving_ids(dump, number)
+        except ValueError:
+            if not skip_broken:
+                raise
+            return set()
+
+    with ThreadPoolExecutor(workers) as pool:
+        return tuple(sorted(set().union(*pool.map(ids, dump.numbers))))
 
 
 def _stencil(index: np.ndarray, dynamic: Iterable[int], hit: np.ndarray) -> np.ndarray:
@@ -227,7 +201,7 @@ def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vectors / np.maximum(length, 1e-6), length
 
 
-def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> tuple[Frame, np.ndarray, dict[str, int]]:
+def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> Converted:
     """One frame, its reference, and counts of what had to be repaired."""
     passes = _lr(dump, number)
     camera, jitter, depth = dump.cameras[number], dump.jitters[number], _depth(passes)
@@ -278,87 +252,50 @@ def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> tuple[Frame,
         "mixed": int(mixed.sum()),
         "negative": negative + negative_reference,
     }
-    return frame, reference, counts
+    return Converted(frame, reference, counts)
 
 
-def default_splits(first: int, last: int) -> dict[str, tuple[int, int]]:
-    """First and last frame of 60 % train, 10 % validation, 30 % test, in this order; below 10 frames all is test."""
-    length = last - first + 1
-    if length < 10:
-        return {"test": (first, last)}
-    train, validation = first + int(0.6 * length), max(1, round(0.1 * length))
-    return {
-        "train": (first, train - 1),
-        "validation": (train, train + validation - 1),
-        "test": (train + validation, last),
-    }
-
-
-def clip_segments(name: str, first: int, ranges: Mapping[str, tuple[int, int]]) -> dict[str, list[Segment]]:
-    """Segments of one clip: training clips lie within their range, the others are streamed from the clip's start."""
-    return {
-        split: [Segment(name, start if split == "train" else first, last, start)]
-        for split, (start, last) in ranges.items()
-    }
-
-
-def import_blender(
-    source: str | os.PathLike,
-    out: str | os.PathLike,
-    *,
-    splits: Mapping[str, tuple[int, int]] | None = None,
-    name: str | None = None,
-    on_frame: Callable[[int, int], Any] = lambda done, total: None,
-) -> ImportReport:
-    """Import a clip that Blender rendered; resumes where it was interrupted.
+@dataclasses.dataclass(frozen=True)
+class BlenderClip:
+    """A clip that Blender rendered; a ``stream.Clip``.
 
     Background (depth >= 1e9) becomes depth +inf with empty buffers and the sky motion of the cameras; normals get unit
     length; ``previous = current + (X, -Y)`` of Vector; mixed silhouette pixels of static objects move with the cameras;
     negative colour becomes 0. Objects that move by themselves keep their index as stencil, all others get 0.
+    """
 
-    Args:
-      source: the folder with ``meta.json``.
-      out: the dataset's folder.
-      splits: split -> numbers of the first and last frame, both included; ``default_splits`` if None. Validation and
-        test are streamed from the clip's first frame and scored in their range.
-      name: of the sequence; the folder's name if None.
-      on_frame: called with (frames done, frames in all).
+    name: str
+    dump: _Dump
+    workers: int | None
+    skip_broken: bool
+
+    @functools.cached_property
+    def dynamic(self) -> tuple[int, ...]:
+        """Indices of the objects that move by themselves; reads every frame once."""
+        return _dynamic_ids(self.dump, self.workers, self.skip_broken)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return tuple(self.dump.numbers)
+
+    @property
+    def source(self) -> dict[str, Any]:
+        """What the dataset keeps."""
+        return {"preset": "blender", "frames": [self.numbers[0], self.numbers[-1]], "dynamic": list(self.dynamic)}
+
+    def convert(self, number: int) -> Converted:
+        """Read and convert one frame; a ValueError names the file and what is missing or wrong."""
+        return _convert(self.dump, number, self.dynamic)
+
+
+def open_blender(folder: Path, *, workers: int | None, skip_broken: bool) -> BlenderClip:
+    """The clip in a folder with ``meta.json``.
 
     Raises:
       ValueError: names the file and what is missing or wrong.
     """
-    folder = Path(source)
     dump = _read_meta(folder)
-    name = name or folder.resolve().name
-    numbers = dump.numbers
-    _check_files(dump)
-    ranges = dict(splits) if splits else default_splits(numbers[0], numbers[-1])
-    _check_ranges(ranges, numbers)
-    dynamic = _dynamic_ids(dump)
-    writer = SequenceWriter(
-        out, name, source={"preset": "blender", "frames": [numbers[0], numbers[-1]], "dynamic": list(dynamic)}
-    )
-    for done, number in enumerate(numbers):
-        if number not in writer:
-            frame, reference, counts = _convert(dump, number, dynamic)
-            writer.write(number, frame, reference, notes=counts)
-        on_frame(done + 1, len(numbers))
-    info = writer.finish()
-    segments = clip_segments(name, numbers[0], ranges)
-    dataset = write_dataset(out, segments, source={"preset": "blender"})
-    totals: dict[str, int] = {}
-    for record in info.frames:
-        for key, count in record["notes"].items():
-            totals[key] = totals.get(key, 0) + count
-    return ImportReport(dataset, info, dynamic, totals)
-
-
-PRESETS: Mapping[str, Callable[..., ImportReport]] = {"blender": import_blender}
-"""Preset name -> function, all with ``import_blender``'s signature."""
-
-
-def import_dataset(source: str | os.PathLike, out: str | os.PathLike, preset: str, **options: Any) -> ImportReport:
-    """Import with a preset by name; an unknown one is a ValueError that lists those there are."""
-    if preset not in PRESETS:
-        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
-    return PRESETS[preset](source, out, **options)
+    if not skip_broken:
+        _check_files(dump)
+    return BlenderClip(folder.resolve().name, dump, workers, skip_broken)

@@ -1,0 +1,93 @@
+"""Frames of colour, depth and motion alone: what runs on them, and what says clearly that it cannot."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from essjax import methods, warp
+from essjax.frames import OPTIONAL_GBUFFERS, select_time
+from essjax.rollout import alternate, every, unroll
+from experiments import comparison
+from experiments.config import make_config
+from experiments.evaluate import Clip
+from tests.helpers import make_frames, make_sequence
+
+
+def bare(frames):
+    """Without every G-buffer but depth."""
+    return dataclasses.replace(
+        frames, gbuffers=dataclasses.replace(frames.gbuffers, **dict.fromkeys(OPTIONAL_GBUFFERS)), camera=None
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "schedule"),
+    [
+        (methods.warp(), alternate()),
+        (methods.bilinear(), every()),
+        (methods.jau(), every()),
+        (methods.taau_half(), alternate()),
+        (methods.taa(), every()),
+    ],
+    ids=lambda value: value.info.name if hasattr(value, "info") else "",
+)
+def test_heuristics_see_nothing_but_color_depth_and_motion(method, schedule):
+    frames = make_frames(3, T=4, B=1, H=6, W=8)
+    run = jax.jit(lambda frames: unroll(method, variables, frames, schedule).image)
+    variables = method.init(jax.random.key(0), select_time(frames, 0))
+    np.testing.assert_array_equal(run(bare(frames)), run(frames))
+
+
+@pytest.mark.parametrize("method", [methods.extrass_w(), methods.extrass_e(), methods.extrass()])
+def test_guided_methods_say_which_buffer_is_missing_and_why(method):
+    frames = make_frames(0, T=2, B=1, H=8, W=8)
+    frames = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, normal=None))
+    with pytest.raises(
+        ValueError,
+        match=rf"{method.info.name} needs the buffers normal, which these frames do not have .*normal tells surfaces "
+        r"apart: guides the warp\. Render or import",
+    ):
+        unroll(method, {}, frames, alternate())
+    if method.info.name != "extrass-w":  # training makes the variables before the first rollout
+        with pytest.raises(ValueError, match=rf"{method.info.name} needs the buffers base_color, normal"):
+            method.init(jax.random.key(0), select_time(bare(frames), 0))
+
+
+def test_guides_of_bare_frames():
+    with pytest.raises(ValueError, match="guided warps need the buffers base_color, normal, which"):
+        warp.guides(bare(make_frames(0, T=1, B=1)).gbuffers)
+
+
+def test_holes_without_normals_are_those_of_zero_normals():
+    now, before = (bare(select_time(make_frames(5, T=2, B=1), t)) for t in (1, 0))
+    zero = [
+        dataclasses.replace(f.gbuffers, normal=np.zeros((*f.motion.shape[:-1], 3), np.float32)) for f in (now, before)
+    ]
+    got = warp.hole_mask(now.gbuffers, before.gbuffers, now.motion)
+    np.testing.assert_array_equal(got, warp.hole_mask(*zero, now.motion))
+    assert 0.1 < np.mean(got) < 0.9
+
+
+def test_a_comparison_leaves_out_what_lacks_a_buffer_and_says_so():
+    sequence = jax.tree.map(lambda leaf: leaf[:, 0], make_sequence(0, T=3, B=1))
+    poor = dataclasses.replace(sequence, frames=bare(sequence.frames))
+    assert comparison.unfit(methods.extrass_w(), sequence) == ""
+    assert comparison.unfit(methods.extrass_w(), poor) == "this dataset has no base_color, normal"
+    assert comparison.unfit(methods.taau(2), poor) == ""
+    config, holes = make_config("smoke", []), np.zeros((3, 12, 18, 1))
+    remarks = {
+        name: comparison.notes(None, [Clip("a", s, (0, 1, 2), [1, 2], holes, False)], {}, config)  # type: ignore[arg-type]
+        for name, s in (("rich", sequence), ("poor", poor))
+    }
+    assert "No extrass-w row: this dataset has no base_color, normal." in remarks["poor"]
+    assert not any("extrass-w" in remark for remark in remarks["rich"])
+
+
+def test_a_comparison_leaves_out_upscalers_where_the_reference_is_not_larger():
+    sequence = jax.tree.map(lambda leaf: leaf[:, 0], make_sequence(0, T=2, B=1, scale=1))
+    assert comparison.unfit(methods.bilinear(2), sequence) == (
+        "it enlarges 2 times, this dataset's reference is 1 times larger"
+    )
+    assert comparison.unfit(methods.warp(), sequence) == ""
