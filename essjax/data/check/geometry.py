@@ -69,9 +69,10 @@ class GeometryCheck:
 
 
 def depth_defects(depth: np.ndarray) -> dict[str, np.ndarray]:
-    """Masks: all pixels, depth <= 0, finite depth beyond ``FAR``."""
+    """Masks: all pixels, depth < 0, depth <= 0, finite depth beyond ``FAR``."""
     return {
         "pixels": np.ones_like(depth, bool),
+        "negative": depth < 0,
         "not positive": depth <= 0,
         "far": np.isfinite(depth) & (depth > FAR),
     }
@@ -187,6 +188,10 @@ def _judge_order(nearer: int, farther: int) -> Finding:
 
 def _judge_depth(checks: Mapping[str, GeometryCheck], motion_wrong: bool) -> Finding:
     records = [record for check in checks.values() for record in check.distances]
+    pixels, negative, not_positive = (_sum(checks, name) for name in ("pixels", "negative", "not positive"))
+    if negative:
+        fix = "depth is positive view-space z: negate it at import if -z is stored"
+        return Finding(ROWS[0], "wrong", f"is negative in {negative / pixels:.1%} of the pixels", fix)
     nearer, farther = _sum(checks, "hidden by nearer"), _sum(checks, "hidden by farther")
     if records:
         result = _judge_distances(records)
@@ -196,12 +201,11 @@ def _judge_depth(checks: Mapping[str, GeometryCheck], motion_wrong: bool) -> Fin
         result = _judge_order(nearer, farther)
     if result.verdict == "wrong":
         return result
-    if _sum(checks, "not positive"):
-        share = _sum(checks, "not positive") / _sum(checks, "pixels")
-        fix = "depth is positive view-space z: negate it if -z is stored; write +inf for the background"
-        return Finding(ROWS[0], "wrong", f"not positive in {share:.1%} of the pixels", fix, result.numbers)
+    if not_positive:
+        fix = "depth is positive view-space z: if 0 is the background, write it as +inf"
+        return Finding(ROWS[0], "wrong", f"is 0 in {not_positive / pixels:.1%} of the pixels", fix, result.numbers)
     if _sum(checks, "far"):
-        found = f"{_sum(checks, 'far') / _sum(checks, 'pixels'):.1%} of the pixels are beyond {FAR:g} m"
+        found = f"{_sum(checks, 'far') / pixels:.1%} of the pixels are beyond {FAR:g} m"
         return Finding(ROWS[0], "warning", found, "if this is the background, write it as +inf", result.numbers)
     return result
 

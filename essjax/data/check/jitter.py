@@ -1,6 +1,7 @@
 """Jitter: where in the reference the rendered pixels really lie, and what one frame's jitter says about the next."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -13,8 +14,9 @@ from essjax.data.check.finding import Finding, some
 from essjax.data.check.motion import Look, rendered_errors, tone
 from essjax.data.check.pairs import Step
 from essjax.data.check.readings import jitter_step
-from essjax.typing import Array, Color, Positions
-from essjax.warp import inside_mask, sample
+from essjax.typing import Array, Color
+from essjax.warp import inside_mask
+from essjax.warp.sampling import axis_taps
 
 ROWS = ("jitter, references", "jitter, frame to frame", "sub-pixel shift")
 READINGS = {
@@ -47,27 +49,54 @@ SAMPLES = 8192
 _BORDER = 2
 
 
+def _read(image: Array, positions: Array, axis: int) -> Array:
+    """Bicubic read of ``[H, W, C]`` at ``positions [n]`` along axis 0 or 1.
+
+    Not bilinear: that blurs between pixels, and a blurred reference is closer to noisy frames wherever it is read.
+    """
+    shape = (-1, 1, 1) if axis == 0 else (1, -1, 1)
+    taps = axis_taps(positions, image.shape[axis], "bicubic", "border")
+    return sum((jnp.take(image, t.index, axis=axis) * t.weight.reshape(shape) for t in taps), jnp.zeros(()))
+
+
 @partial(jax.jit, static_argnames="scale")
-def _offset_errors(pixels: Color, reference: Color, places: Positions, offsets: Array, key: Array, *, scale: int):
-    """Mean absolute error ``[N]`` of LR ``pixels [P, 3]`` against the reference at ``places [P, 2]`` + offset."""
-    toned = tone(pixels, key)
-    error = lambda offset: jnp.abs(tone(sample(reference, ((places + offset) * scale)[None])[0], key) - toned).mean()
-    return jax.lax.map(error, offsets)
+def _grid_errors(
+    pixels: Color, reference: Color, rows: Array, columns: Array, jitters: Array, key: Array, *, scale: int
+):
+    """Mean absolute error ``[N, dy, dx]`` of LR ``pixels [h, w, 3]`` against the reference at their place + an offset.
+
+    Args:
+      pixels: of the frame, at ``rows`` and ``columns``.
+      reference: ``[sH, sW, 3]``.
+      rows: ``[h]`` y of the pixel centres, LR pixels.
+      columns: ``[w]`` x of the pixel centres.
+      jitters: ``[N, 2]`` (x, y); the offsets are these plus ``SHIFTS`` along each axis.
+      key: see ``tone``.
+      scale: reference size over frame size.
+    """
+    toned, reference = tone(pixels, key), tone(reference, key)
+    shifts = jnp.asarray(SHIFTS, jnp.float32)
+
+    def of_jitter(jitter: Array) -> Array:
+        def of_column(dx: Array) -> Array:
+            wide = _read(reference, (columns + jitter[0] + dx) * scale, 1)
+            error = lambda dy: jnp.abs(_read(wide, (rows + jitter[1] + dy) * scale, 0) - toned).mean()
+            return jax.lax.map(error, shifts)
+
+        return jax.lax.map(of_column, shifts).T
+
+    return jax.lax.map(of_jitter, jitters)
 
 
 def reference_errors(step: Step) -> np.ndarray:
     """``[readings, dy, dx]``: how far the frame is from the reference read at pixel centre + jitter + (dx, dy)."""
     height, width = step.size
-    stride = max(1, int(np.ceil(np.sqrt(height * width / SAMPLES))))
-    rows, columns = (slice(_BORDER, n - _BORDER, stride) for n in (height, width))
-    y, x = np.mgrid[:height, :width][:, rows, columns].astype(np.float32) + 0.5
-    dy, dx = np.meshgrid(SHIFTS, SHIFTS, indexing="ij")
-    shifts = np.stack([dx, dy], axis=-1)
-    offsets = np.stack([matrix @ step.now.jitter + shifts for matrix in MATRICES.values()]).astype(np.float32)
-    color = np.asarray(step.now.color)[rows, columns].reshape(-1, 3)
-    places = np.stack([x, y], axis=-1).reshape(-1, 2)
-    errors = _offset_errors(color, step.reference, places, offsets.reshape(-1, 2), step.key, scale=step.scale)
-    return np.asarray(errors, np.float64).reshape(offsets.shape[:3])
+    stride = max(1, math.ceil(math.sqrt(height * width / SAMPLES)))
+    rows, columns = (np.arange(_BORDER, n - _BORDER, stride) for n in (height, width))
+    pixels = np.asarray(step.now.color)[rows][:, columns]
+    jitters = np.stack([matrix @ step.now.jitter for matrix in MATRICES.values()]).astype(np.float32)
+    centres = (rows + np.float32(0.5), columns + np.float32(0.5))
+    return np.asarray(_grid_errors(pixels, step.reference, *centres, jitters, step.key, scale=step.scale), np.float64)
 
 
 @dataclasses.dataclass
