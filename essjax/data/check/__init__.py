@@ -1,20 +1,20 @@
 """``check_dataset``: proves a dataset's conventions on its own pictures, and says what to change."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from essjax.data.check.compare import best_reading
+from essjax.data.check.compare import total
 from essjax.data.check.continuity import ContinuityCheck, judge_continuity
 from essjax.data.check.finding import VERDICTS, Finding
 from essjax.data.check.geometry import GeometryCheck, judge_geometry
 from essjax.data.check.jitter import JitterCheck, judge_jitter
 from essjax.data.check.motion import MotionCheck, judge_motion, look
-from essjax.data.check.pairs import Step, choose, steps
+from essjax.data.check.pairs import Step, choose, read_step, steps
 from essjax.data.check.pictures import write_pictures
 from essjax.data.check.values import ValuesCheck, judge_values
-from essjax.data.layout import Dataset
+from essjax.data.layout import Dataset, SequenceInfo
 
 __all__ = ["VERDICTS", "CheckReport", "Finding", "check_dataset"]
 
@@ -56,7 +56,7 @@ class _Checks:
     def __init__(self):
         self.values, self.geometry, self.jitter = ValuesCheck(), GeometryCheck(), JitterCheck()
         self.motion, self.continuity = MotionCheck(), ContinuityCheck()
-        self.shown: Step | None = None
+        self.shown: int | None = None
 
     def add(self, step: Step) -> None:
         self.values.add(step)
@@ -70,7 +70,29 @@ class _Checks:
         self.motion.add(step, looked)
         self.jitter.add_pair(step, looked)
         self.geometry.add_pair(step, looked)
-        self.shown = step
+        self.shown = step.number
+
+
+def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
+    motion = judge_motion([check.motion for check in checks], info)
+    motion_wrong = any(finding.verdict == "wrong" for finding in motion)
+    return [
+        *motion,
+        *judge_jitter([check.jitter for check in checks], motion_wrong=motion_wrong, scale=info.scale),
+        *judge_geometry([check.geometry for check in checks], motion_wrong=motion_wrong),
+        *judge_values([check.values for check in checks]),
+        *judge_continuity([check.continuity for check in checks]),
+    ]
+
+
+def _judge_with_each_alone(checks: Mapping[str, _Checks], info: SequenceInfo) -> list[Finding]:
+    """The findings over all sequences together, and where those see nothing wrong, of one that is wrong alone."""
+    findings = _judge(list(checks.values()), info)
+    for name, check in checks.items():
+        for row, alone in enumerate(_judge([check], info)):
+            if alone.verdict == "wrong" and findings[row].verdict != "wrong":
+                findings[row] = dataclasses.replace(alone, found=f"sequence {name}: {alone.found}")
+    return findings
 
 
 def check_dataset(
@@ -91,7 +113,7 @@ def check_dataset(
     Raises:
       ValueError: a file is missing or damaged; the message names it.
     """
-    total = sum(len(choose(info, pairs)) for info in dataset.sequences.values())
+    frames = sum(len(choose(info, pairs)) for info in dataset.sequences.values())
     checks: dict[str, _Checks] = {}
     done = 0
     for name in dataset.sequences:
@@ -99,20 +121,12 @@ def check_dataset(
         for step in steps(dataset, name, pairs):
             checks[name].add(step)
             done += 1
-            progress(done, total)
-    by = lambda field: {name: getattr(check, field) for name, check in checks.items()}
-    motion = judge_motion(by("motion"), dataset.info)
-    motion_wrong = any(finding.verdict == "wrong" for finding in motion)
-    findings = [
-        *motion,
-        *judge_jitter(by("jitter"), motion_wrong=motion_wrong, scale=dataset.info.scale),
-        *judge_geometry(by("geometry"), motion_wrong=motion_wrong),
-        *judge_values(by("values")),
-        *judge_continuity(by("continuity")),
-    ]
+            progress(done, frames)
+    findings = _judge_with_each_alone(checks, dataset.info)
     written: list[Path] = []
     if pictures is not None:
-        best = best_reading(check.motion.reference for check in checks.values())
-        for check in checks.values():
-            written += write_pictures(Path(pictures), check.shown, best) if check.shown is not None else []
-    return CheckReport(tuple(findings), total, sum(len(i.frames) for i in dataset.sequences.values()), tuple(written))
+        best = total(check.motion.reference for check in checks.values()).best()
+        for name, check in checks.items():
+            if check.shown is not None:
+                written += write_pictures(Path(pictures), read_step(dataset, name, check.shown), best)
+    return CheckReport(tuple(findings), frames, sum(len(i.frames) for i in dataset.sequences.values()), tuple(written))

@@ -94,7 +94,8 @@ class Comparison:
         return sorted((b for b in range(1, len(self.names)) if self.decidable(0, b)), key=lambda b: self.margin(0, b))
 
 
-def _total(comparisons: Iterable[Comparison]) -> Comparison:
+def total(comparisons: Iterable[Comparison]) -> Comparison:
+    """The comparison over all of several sequences."""
     comparisons = list(comparisons)
     result = Comparison(comparisons[0].names)
     result.count = np.sum([c.count for c in comparisons], axis=0)
@@ -102,14 +103,24 @@ def _total(comparisons: Iterable[Comparison]) -> Comparison:
     return result
 
 
-def best_reading(comparisons: Iterable[Comparison]) -> int:
-    """Index of the best reading over all sequences."""
-    return _total(comparisons).best()
-
-
-def _judge_one(
-    check: str, comparison: Comparison, fixes: Mapping[str, str], nothing: str, ignore: tuple[str, ...]
+def judge(
+    check: str,
+    comparisons: Iterable[Comparison],
+    fixes: Mapping[str, str],
+    nothing: str,
+    *,
+    ignore: tuple[str, ...] = (),
 ) -> Finding:
+    """The verdict over several sequences together.
+
+    Args:
+      check: name of the row.
+      comparisons: one per sequence.
+      fixes: reading -> what to do if it is the right one.
+      nothing: what to say if no reading can be told from the stated one.
+      ignore: readings whose being different does not make the stated one decidable.
+    """
+    comparison = total(comparisons)
     names, rivals, best = comparison.names, comparison.rivals(), comparison.best()
     numbers = {names[b]: round(comparison.margin(0, b), 2) for b in rivals}
     if best:
@@ -130,29 +141,3 @@ def _judge_one(
     if unknown:
         found += f"; too little motion to tell '{unknown[0]}' from it"
     return Finding(check, "ok", found, "", numbers)
-
-
-def judge(
-    check: str,
-    comparisons: Mapping[str, Comparison],
-    fixes: Mapping[str, str],
-    nothing: str,
-    *,
-    ignore: tuple[str, ...] = (),
-) -> Finding:
-    """The verdict over all sequences together, or that over one of them if it alone is wrong.
-
-    Args:
-      check: name of the row.
-      comparisons: by sequence.
-      fixes: reading -> what to do if it is the right one.
-      nothing: what to say if no reading can be told from the stated one.
-      ignore: readings whose being different does not make the stated one decidable.
-    """
-    result = _judge_one(check, _total(comparisons.values()), fixes, nothing, ignore)
-    if result.verdict != "wrong":
-        for name, comparison in comparisons.items():
-            alone = _judge_one(check, comparison, fixes, nothing, ignore)
-            if alone.verdict == "wrong":
-                return dataclasses.replace(alone, found=f"sequence {name}: {alone.found}")
-    return result

@@ -1,7 +1,7 @@
 """From one frame to the next: duplicated frames, cuts that nobody marked, marked cuts that are none."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -63,10 +63,10 @@ def _moves(step: Step) -> bool:
     return any(np.percentile(np.linalg.norm(m, axis=-1), 90) >= DIFFERENT for m in motions if m is not None)
 
 
-def judge_continuity(checks: Mapping[str, ContinuityCheck]) -> list[Finding]:
+def judge_continuity(checks: Sequence[ContinuityCheck]) -> list[Finding]:
     """Findings about duplicated frames and about cuts."""
-    gather = lambda field: [where for check in checks.values() for where in getattr(check, field)]
-    pairs, marked = (sum(getattr(check, field) for check in checks.values()) for field in ("pairs", "marked"))
+    gather = lambda field: [where for check in checks for where in getattr(check, field)]
+    pairs, marked = (sum(getattr(check, field) for check in checks) for field in ("pairs", "marked"))
     return [
         _judge_duplicates(gather("duplicates"), gather("duplicate_references"), pairs),
         _judge_cuts(gather("unmarked"), gather("not_cuts"), pairs, marked),

@@ -1,7 +1,7 @@
 """Depth, normals and cameras: do they belong together, and does what hides lie in front of what is hidden?"""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -141,11 +141,14 @@ def occlusion_order(step: Step, looked: Look) -> dict[str, np.ndarray]:
     }
 
 
-def _sum(checks: Mapping[str, GeometryCheck], name: str) -> int:
-    return sum(check.counts.get(name, 0) for check in checks.values())
+def _sum(checks: Sequence[GeometryCheck], name: str) -> int:
+    return sum(check.counts.get(name, 0) for check in checks)
 
 
-REVERSED = "depth is reversed (near is large): for a reversed infinite z-buffer, depth = near / value, at import"
+REVERSED = (
+    "depth is reversed (near is large): for a reversed infinite z-buffer, depth = near / value, at import (recipe: "
+    "kind in [depth])"
+)
 
 
 def _judge_distances(records: list[dict[str, float]]) -> Finding:
@@ -158,7 +161,9 @@ def _judge_distances(records: list[dict[str, float]]) -> Finding:
         return row("wrong", f"falls with distance (rank correlation {median['order']:.2f})", REVERSED)
     if median["along ray"] > 0.9:
         return row(
-            "wrong", "is the distance to the camera", "depth lies along the ray: multiply it by the ray's cosine"
+            "wrong",
+            "is the distance to the camera",
+            "depth lies along the ray: multiply it by the ray's cosine (recipe: kind in [depth])",
         )
     if median["scaled"] > 0.9:
         found = f"is {median['ratio']:.4g} times the distance of the world positions"
@@ -186,8 +191,8 @@ def _judge_order(nearer: int, farther: int) -> Finding:
     return Finding(ROWS[0], "ok", found, "", numbers)
 
 
-def _judge_depth(checks: Mapping[str, GeometryCheck], motion_wrong: bool) -> Finding:
-    records = [record for check in checks.values() for record in check.distances]
+def _judge_depth(checks: Sequence[GeometryCheck], motion_wrong: bool) -> Finding:
+    records = [record for check in checks for record in check.distances]
     pixels, negative, not_positive = (_sum(checks, name) for name in ("pixels", "negative", "not positive"))
     if negative:
         fix = "depth is positive view-space z: negate it at import if -z is stored"
@@ -210,7 +215,7 @@ def _judge_depth(checks: Mapping[str, GeometryCheck], motion_wrong: bool) -> Fin
     return result
 
 
-def _judge_cameras(checks: Mapping[str, GeometryCheck], depth: Finding, motion_wrong: bool) -> Finding:
+def _judge_cameras(checks: Sequence[GeometryCheck], depth: Finding, motion_wrong: bool) -> Finding:
     static, off = _sum(checks, "static"), _sum(checks, "off camera")
     if not static:
         return Finding(ROWS[1], "not decidable", "no cameras, or nothing that stands still")
@@ -221,12 +226,12 @@ def _judge_cameras(checks: Mapping[str, GeometryCheck], depth: Finding, motion_w
     found = f"explain the motion of {1 - off / static:.1%} of the pixels that stand still, to {STATIC} px"
     if off < 0.5 * static:
         return Finding(ROWS[1], "ok", found, "", numbers)
-    marked = all(check.has_stencil for check in checks.values())
+    marked = all(check.has_stencil for check in checks)
     fix = "is camera_to_world row-major, looking along -Z with y up, of the same frame? focal and center in LR pixels?"
     return Finding(ROWS[1], "wrong" if marked else "warning", found, fix, numbers)
 
 
-def _judge_normals(checks: Mapping[str, GeometryCheck]) -> Finding:
+def _judge_normals(checks: Sequence[GeometryCheck]) -> Finding:
     there, off, seen = (_sum(checks, name) for name in ("normals", "off length", "seen"))
     if not there:
         return Finding(ROWS[2], "not decidable", "there are none")
@@ -235,7 +240,7 @@ def _judge_normals(checks: Mapping[str, GeometryCheck]) -> Finding:
         found = f"{off / there:.1%} of the normals are not of unit length"
         encoded = not _sum(checks, "negative component")
         fix = (
-            "normals are encoded in [0, 1]: n = 2 v - 1 at import"
+            "normals are encoded in [0, 1]: n = 2 v - 1 at import (recipe: encoding in [normal])"
             if encoded
             else "divide them by their length at import"
         )
@@ -248,7 +253,7 @@ def _judge_normals(checks: Mapping[str, GeometryCheck]) -> Finding:
     return Finding(ROWS[2], "ok", found, "", numbers)
 
 
-def judge_geometry(checks: Mapping[str, GeometryCheck], *, motion_wrong: bool) -> list[Finding]:
+def judge_geometry(checks: Sequence[GeometryCheck], *, motion_wrong: bool) -> list[Finding]:
     """Findings about depth, cameras and normals."""
     depth = _judge_depth(checks, motion_wrong)
     return [depth, _judge_cameras(checks, depth, motion_wrong), _judge_normals(checks)]

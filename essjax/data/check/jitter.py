@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -29,9 +29,10 @@ READINGS = {
 }
 """Reading -> the matrix that makes it of the jitter that is stated."""
 FIXES = {
-    "negated": "jitter has the wrong sign: negate x and y at import (the sample lies at pixel centre + jitter)",
+    "negated": "jitter has the wrong sign: negate x and y at import (the sample lies at pixel centre + jitter; recipe: "
+    "sign in [jitter])",
     "x flipped": "jitter x has the wrong sign: negate it at import",
-    "y flipped": "jitter y has the wrong sign: negate it at import (y points down in essjax)",
+    "y flipped": "jitter y has the wrong sign: negate it at import (y points down; recipe: y in [jitter])",
     "swapped": "jitter x and y are swapped: exchange them at import",
     "none": "the rendered frames are not jittered against the references: set the jitter to 0 at import, or switch the "
     "jitter of the reference off",
@@ -140,8 +141,8 @@ def locate_minimum(surface: np.ndarray) -> np.ndarray:
     return np.array([refine(surface[row], int(column)), refine(surface[:, column], int(row))])
 
 
-def _judge_range(checks: Mapping[str, JitterCheck]) -> Finding | None:
-    outside = [where for check in checks.values() for where in check.outside]
+def _judge_range(checks: Sequence[JitterCheck]) -> Finding | None:
+    outside = [where for check in checks for where in check.outside]
     if not outside:
         return None
     found = f"jitter beyond half a pixel in {len(outside)} frames: {some(outside)}"
@@ -186,10 +187,10 @@ def _judge_shift(surface: np.ndarray, scale: int) -> Finding:
     return Finding(check, "wrong" if size >= SHIFT_WRONG else "warning", where, fix, numbers)
 
 
-def judge_jitter(checks: Mapping[str, JitterCheck], *, motion_wrong: bool, scale: int) -> list[Finding]:
+def judge_jitter(checks: Sequence[JitterCheck], *, motion_wrong: bool, scale: int) -> list[Finding]:
     """Findings about jitter: against references, from frame to frame, and the constant shift."""
-    surfaces = np.sum([check.against for check in checks.values()], axis=0)
-    jitters = np.concatenate([np.stack(check.jitters) for check in checks.values()])
+    surfaces = np.sum([check.against for check in checks], axis=0)
+    jitters = np.concatenate([np.stack(check.jitters) for check in checks])
     if not np.abs(jitters).max() >= 0.05:
         no_jitter = [Finding(name, "not decidable", "the frames are not jittered") for name in ROWS[:2]]
         return [*no_jitter, _judge_shift(surfaces[0], scale)]
@@ -197,7 +198,7 @@ def judge_jitter(checks: Mapping[str, JitterCheck], *, motion_wrong: bool, scale
     if motion_wrong:
         between = Finding(ROWS[1], "not decidable", "the motion is wrong", "put the motion right, then check again")
     else:
-        between = judge(ROWS[1], {n: c.between for n, c in checks.items()}, FIXES, "the jitter hardly changes")
+        between = judge(ROWS[1], [check.between for check in checks], FIXES, "the jitter hardly changes")
     if against.verdict == "wrong":
         shift = Finding(ROWS[2], "not decidable", "the jitter is wrong", "put the jitter right, then check again")
     else:

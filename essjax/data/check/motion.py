@@ -1,7 +1,7 @@
 """Motion: the picture before, warped as the dataset states it and as it could have been meant."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 from essjax.data.check.compare import DIFFERENT, Comparison, judge
 from essjax.data.check.finding import Finding
 from essjax.data.check.pairs import Step
-from essjax.data.check.readings import JITTERED, NONE, READINGS, RENDERED, fix_of, jitter_step, motions_of
+from essjax.data.check.readings import JITTERED, NONE, READINGS, fix_of, jitter_step, motions_of
 from essjax.data.layout import SequenceInfo
 from essjax.typing import Array, Color, Image, Jitter, Motion
 from essjax.warp import backward_warp, hole_mask, inside_mask, upsample_motion
@@ -105,7 +105,7 @@ class MotionCheck:
     """Sums over the pairs of one sequence."""
 
     reference: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
-    rendered: Comparison = dataclasses.field(default_factory=lambda: Comparison(RENDERED))
+    rendered: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
     squares: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
     pixels: int = 0
 
@@ -116,12 +116,12 @@ class MotionCheck:
         valid = unoccluded(step) & looked.usable[0]
         self.squares += [looked.squares[0][valid].sum(), looked.squares[NONE][valid].sum()]
         self.pixels += int(valid.sum())
-        rows = [READINGS.index(name) for name in RENDERED]
-        lookups = looked.motions[rows] + jitter_step(step)
-        errors = np.full(lookups.shape[:3], np.nan, np.float32)
-        for index in np.flatnonzero(np.isfinite(lookups).all(axis=(1, 2, 3))):
+        lookups, usable = looked.motions + jitter_step(step), looked.usable.copy()
+        usable[[READINGS.index(name) for name in JITTERED]] = False
+        errors = np.zeros(usable.shape, np.float32)
+        for index in np.flatnonzero(usable.any(axis=(1, 2))):
             errors[index] = rendered_errors(step, lookups[index])
-        self.rendered.add(errors, lookups, looked.usable[rows])
+        self.rendered.add(errors, lookups, usable)
 
     @property
     def psnr(self) -> tuple[float, float]:
@@ -137,14 +137,14 @@ def rendered_errors(step: Step, lookup: np.ndarray) -> np.ndarray:
     return np.asarray(warp_errors(step.before.color, step.now.color, lookup, zero, step.key, scale=1))[..., 0]
 
 
-def judge_motion(checks: Mapping[str, MotionCheck], info: SequenceInfo) -> list[Finding]:
+def judge_motion(checks: Sequence[MotionCheck], info: SequenceInfo) -> list[Finding]:
     """Findings about motion: against the references, and against the rendered frames."""
     fixes = {name: fix_of(name, info) for name in READINGS}
     still = f"the motion is < {DIFFERENT} px, or nothing is seen twice"
-    against = judge(ROWS[0], {n: c.reference for n, c in checks.items()}, fixes, still, ignore=JITTERED)
-    rendered = judge(ROWS[1], {n: c.rendered for n, c in checks.items()}, fixes, still)
-    pixels = sum(check.pixels for check in checks.values())
-    merged = MotionCheck(squares=np.sum([check.squares for check in checks.values()], axis=0), pixels=pixels)
+    against = judge(ROWS[0], [check.reference for check in checks], fixes, still, ignore=JITTERED)
+    rendered = judge(ROWS[1], [check.rendered for check in checks], fixes, still)
+    pixels = sum(check.pixels for check in checks)
+    merged = MotionCheck(squares=np.sum([check.squares for check in checks], axis=0), pixels=pixels)
     if not merged.pixels:
         return [against, rendered]
     stated, none = merged.psnr

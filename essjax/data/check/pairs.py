@@ -82,12 +82,18 @@ def _key(reference: np.ndarray) -> float:
     return float(np.median(lit)) if lit.size else 1.0
 
 
-def _step(name: str, number: int, cut: bool, sequence: Sequence) -> Step:
-    """The last frame of a read range, and the one before it."""
+def read_step(dataset: Dataset, name: str, number: int) -> Step:
+    """Read a frame, with the frame before it where there is one.
+
+    Raises:
+      ValueError: a file is missing or damaged; ``read_sequence`` names it. Values are not judged here.
+    """
+    info = dataset.sequences[name]
+    paired = number - 1 in info.numbers
+    sequence = read_sequence(dataset, name, (number - paired, number), native=False)
     last: Sequence = select_time(sequence, -1)
-    frames = [_clean_frame(select_time(sequence.frames, i)) for i in range(sequence.frames.motion.shape[0])]
+    frames = [_clean_frame(select_time(sequence.frames, i)) for i in range(1 + paired)]
     references = np.maximum(_clean(np.asarray(sequence.reference)), 0.0)
-    paired = len(frames) == 2
     mask = np.ones(frames[-1].motion.shape[:2], bool)
     for known in (last.valid, last.steady):
         if known is not None and paired:
@@ -96,7 +102,7 @@ def _step(name: str, number: int, cut: bool, sequence: Sequence) -> Step:
     return Step(
         sequence=name,
         number=number,
-        cut=cut,
+        cut=bool(info.frames[info.numbers.index(number)]["cut"]),
         raw={name: np.asarray(image) for name, image in raw.items()},
         now=frames[-1],
         before=frames[0] if paired else None,
@@ -109,14 +115,7 @@ def _step(name: str, number: int, cut: bool, sequence: Sequence) -> Step:
 
 
 def steps(dataset: Dataset, name: str, pairs: int) -> Iterator[Step]:
-    """Read the chosen frames of a sequence, each with the frame before it.
-
-    Raises:
-      ValueError: a file is missing or damaged; ``read_sequence`` names it. Values are not judged here.
-    """
+    """Read the chosen frames of a sequence, each with the frame before it; see ``choose`` and ``read_step``."""
     info = dataset.sequences[name]
     for index in choose(info, pairs):
-        number = info.numbers[index]
-        paired = index > 0 and info.numbers[index - 1] == number - 1
-        frames = read_sequence(dataset, name, (number - paired, number), native=False)
-        yield _step(name, number, bool(info.frames[index]["cut"]), frames)
+        yield read_step(dataset, name, info.numbers[index])

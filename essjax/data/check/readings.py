@@ -10,31 +10,36 @@ from essjax.typing import Array, Jitter, Motion
 
 FIXES = {
     "as stated": "",
-    "x flipped": "motion.X has the wrong sign: negate it at import",
-    "y flipped": "motion.Y has the wrong sign: negate it at import (y points down in essjax)",
-    "both flipped": "motion points the wrong way: negate X and Y at import (previous = current + motion)",
-    "swapped": "motion.X and motion.Y are swapped: exchange them at import",
+    "x flipped": "motion.X has the wrong sign: negate it at import (recipe: x in [motion])",
+    "y flipped": "motion.Y has the wrong sign: negate it at import (y points down; recipe: y in [motion])",
+    "both flipped": "motion points the wrong way: negate X and Y at import (previous = current + motion; recipe: "
+    "sign in [motion])",
+    "swapped": "motion.X and motion.Y are swapped: exchange them at import (recipe: motion in [channels])",
     "swapped, x flipped": "motion is stored as (y, -x): exchange X and Y at import, then negate X",
     "swapped, y flipped": "motion is stored as (-y, x): exchange X and Y at import, then negate Y",
     "swapped, both flipped": "motion is stored as (-y, -x): exchange X and Y at import and negate both",
-    "times 2": "motion is too short: multiply it by 2 at import",
-    "times 1/2": "motion is too long: multiply it by 0.5 at import",
-    "times scale": "motion is too short: multiply it by the scale, {scale}, at import",
-    "times 1/scale": "motion is in pixels of the reference: divide it by the scale, {scale}, at import",
-    "times size (UV)": "motion is in UV units: multiply X by {width} and Y by {height} at import",
-    "times half size (NDC)": "motion is in NDC: multiply X by {width}/2 and Y by -{height}/2 at import",
+    "times 2": "motion is too short: multiply it by 2 at import (recipe: scale or unit in [motion])",
+    "times 1/2": "motion is too long: multiply it by 0.5 at import (recipe: scale, unit or resolution in [motion])",
+    "times scale": "motion is too short: multiply it by {scale}, the scale, at import (recipe: scale in [motion])",
+    "times 1/scale": "motion is in pixels of the reference: divide it by {scale} at import (recipe: resolution in "
+    "[motion])",
+    "times size (UV)": "motion is in UV units: multiply X by {width} and Y by {height} at import (recipe: unit in "
+    "[motion])",
+    "times half size (NDC)": "motion is in NDC: multiply X by {width}/2 and Y by -{height}/2 at import (recipe: unit "
+    "and y in [motion])",
     "plus jitter": "motion has the jitter in it: add jitter(t) - jitter(t-1) to it at import",
-    "minus jitter": "motion has the jitter in it: subtract jitter(t) - jitter(t-1) from it at import",
+    "minus jitter": "motion has the jitter in it: subtract jitter(t) - jitter(t-1) from it at import (recipe: jittered "
+    "in [motion])",
     "none": "motion does not describe the pictures: is it that of another frame (off by one) or of another camera?",
     "of the cameras": "motion is not that of cameras and depth: is it that of another frame (off by one), or without "
     "the camera's part?",
 }
-"""Reading -> what to do if it explains the pictures best. The first is the dataset's; simple ones come first."""
+"""Reading -> what to do if it explains the pictures best. The first is the dataset's; simple ones come first.
+Recipes are those of ``essjax import --preset generic``."""
 READINGS = tuple(FIXES)
 NONE = READINGS.index("none")
 JITTERED = ("plus jitter", "minus jitter")
-RENDERED = tuple(name for name in READINGS if name not in JITTERED)
-"""What jittered frames are asked about: only unjittered references can tell whether jitter is in the motion."""
+"""Only unjittered references can tell whether jitter is in the motion: jittered frames are not asked."""
 
 
 @jax.jit

@@ -1,7 +1,7 @@
 """What the files hold: NaN, infinities, values out of range, channels that never change, colour that looks clipped."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -78,10 +78,10 @@ _FIXES = {
 }
 
 
-def _judge_defects(checks: Mapping[str, ValuesCheck]) -> Finding:
+def _judge_defects(checks: Sequence[ValuesCheck]) -> Finding:
     for kind, fix in _FIXES.items():
         channels: dict[str, list[str]] = {}
-        for check in checks.values():
+        for check in checks:
             for channel, places in check.bad.get(kind, {}).items():
                 channels.setdefault(channel, []).extend(places)
         if channels:
@@ -91,15 +91,12 @@ def _judge_defects(checks: Mapping[str, ValuesCheck]) -> Finding:
     return Finding("values", "ok", "finite and in range")
 
 
-def _extremes(checks: Mapping[str, ValuesCheck]) -> dict[str, tuple[float, float]]:
-    channels = next(iter(checks.values())).low
-    return {
-        c: (min(check.low[c] for check in checks.values()), max(check.high[c] for check in checks.values()))
-        for c in channels
-    }
+def _extremes(checks: Sequence[ValuesCheck]) -> dict[str, tuple[float, float]]:
+    channels = checks[0].low
+    return {c: (min(check.low[c] for check in checks), max(check.high[c] for check in checks)) for c in channels}
 
 
-def _judge_constant(checks: Mapping[str, ValuesCheck]) -> Finding:
+def _judge_constant(checks: Sequence[ValuesCheck]) -> Finding:
     check, extremes = "constant channels", _extremes(checks)
     constant = {c: low for c, (low, high) in extremes.items() if low == high or low > high}
     values = [f"{channel} = {value:.3g}" for channel, value in constant.items()]
@@ -115,11 +112,11 @@ def _judge_constant(checks: Mapping[str, ValuesCheck]) -> Finding:
     return Finding(check, "ok", f"only {some(values)}" if values else "none", "", constant)
 
 
-def _judge_scale(checks: Mapping[str, ValuesCheck]) -> Finding:
+def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
     check, extremes = "colour scale", _extremes(checks)
     for image in ("color", "reference"):
         high = max(extremes[channel][1] for channel in channels_of(image, 3))
-        share = sum(c.at_top[image] for c in checks.values()) / sum(c.pixels[image] for c in checks.values())
+        share = sum(c.at_top[image] for c in checks) / sum(c.pixels[image] for c in checks)
         if high in CLIPPED and share > 1e-4:
             found = f"{image} never exceeds {high:g} and is exactly that in {share:.1%} of its values: it looks clipped"
             fix = "import linear HDR radiance from before tone mapping; if this is 8-bit sRGB, say so at import"
@@ -128,6 +125,6 @@ def _judge_scale(checks: Mapping[str, ValuesCheck]) -> Finding:
     return Finding(check, "ok", f"radiance up to {high:.3g}", "", {"max": high})
 
 
-def judge_values(checks: Mapping[str, ValuesCheck]) -> list[Finding]:
+def judge_values(checks: Sequence[ValuesCheck]) -> list[Finding]:
     """Findings about values, constant channels and the scale of colour."""
     return [_judge_defects(checks), _judge_constant(checks), _judge_scale(checks)]
