@@ -154,9 +154,9 @@ def _print_check(report: CheckReport, path: Path) -> None:
         style = VERDICT_STYLES[finding.verdict]
         table.add_row(finding.check, f"[{style}]{finding.verdict}[/]", escape(finding.found))
     _console.print(table)
-    for finding in report.findings:
-        if finding.fix:
-            _console.print(f"{finding.check}: {finding.fix}", markup=False, soft_wrap=True)
+    fixes = {finding.fix: finding.check for finding in reversed(report.findings) if finding.fix}
+    for fix, name in reversed(fixes.items()):
+        _console.print(f"{name}: {fix}", markup=False, soft_wrap=True)
 
 
 def check(

@@ -7,9 +7,9 @@ from typing import Any
 
 from essjax.data.check.compare import total
 from essjax.data.check.continuity import ContinuityCheck, judge_continuity
-from essjax.data.check.finding import VERDICTS, Finding
+from essjax.data.check.finding import VERDICTS, Finding, some
 from essjax.data.check.geometry import GeometryCheck, judge_geometry
-from essjax.data.check.jitter import JitterCheck, judge_jitter
+from essjax.data.check.jitter import FIXES, JitterCheck, judge_against, judge_between
 from essjax.data.check.motion import MotionCheck, judge_motion, look
 from essjax.data.check.pairs import Step, choose, read_step, steps
 from essjax.data.check.pictures import write_pictures
@@ -74,11 +74,15 @@ class _Checks:
 
 
 def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
-    motion = judge_motion([check.motion for check in checks], info)
+    jitter = [check.jitter for check in checks]
+    against, shift = judge_against(jitter, info.scale)
+    motion = judge_motion([check.motion for check in checks], info, references_jittered=against.fix == FIXES["none"])
     motion_wrong = any(finding.verdict == "wrong" for finding in motion)
     return [
         *motion,
-        *judge_jitter([check.jitter for check in checks], motion_wrong=motion_wrong, scale=info.scale),
+        against,
+        judge_between(jitter, motion_wrong=motion_wrong),
+        shift,
         *judge_geometry([check.geometry for check in checks], motion_wrong=motion_wrong),
         *judge_values([check.values for check in checks]),
         *judge_continuity([check.continuity for check in checks]),
@@ -86,12 +90,16 @@ def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
 
 
 def _judge_with_each_alone(checks: Mapping[str, _Checks], info: SequenceInfo) -> list[Finding]:
-    """The findings over all sequences together, and where those see nothing wrong, of one that is wrong alone."""
+    """The findings over all sequences together, and where one is wrong in its own way, that of this one."""
     findings = _judge(list(checks.values()), info)
-    for name, check in checks.items():
-        for row, alone in enumerate(_judge([check], info)):
-            if alone.verdict == "wrong" and findings[row].verdict != "wrong":
-                findings[row] = dataclasses.replace(alone, found=f"sequence {name}: {alone.found}")
+    alone = {name: _judge([check], info) for name, check in checks.items()}
+    for row, finding in enumerate(findings):
+        wrong = {name: rows[row] for name, rows in alone.items() if rows[row].verdict == "wrong"}
+        if finding.verdict == "wrong" and finding.fix in [other.fix for other in wrong.values()]:
+            continue
+        for other in list(wrong.values())[:1]:  # what the others say would only blur it
+            names = some(name for name, same in wrong.items() if same.fix == other.fix)
+            findings[row] = dataclasses.replace(other, found=f"sequence {names}: {other.found}")
     return findings
 
 

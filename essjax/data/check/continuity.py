@@ -89,7 +89,7 @@ def _judge_cuts(unmarked: list[str], not_cuts: list[str], pairs: int, marked: in
     check, numbers = "cuts", {"marked": marked, "unmarked": len(unmarked), "not cuts": len(not_cuts)}
     if unmarked:
         found = f"{len(unmarked)} frames show nothing of the frame before and are not marked as cuts: {some(unmarked)}"
-        fix = 'set "cut": true for these frames in sequence.json (at import: name the first frame of each shot)'
+        fix = 'set "cut": true for these frames in sequence.json, or import each shot as a sequence of its own'
         return Finding(check, "wrong", found, fix, numbers)
     if not_cuts:
         found = f"{len(not_cuts)} frames marked as cuts go on with the frame before: {some(not_cuts)}"

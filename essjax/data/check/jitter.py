@@ -48,6 +48,9 @@ FRAMES = 12
 SAMPLES = 8192
 """Pixels per frame that are compared with the reference."""
 _BORDER = 2
+JITTERED = 0.05
+"""LR pixels: frames whose jitter stays below are not jittered."""
+NO_JITTER = "the frames are not jittered"
 
 
 def _read(image: Array, positions: Array, axis: int) -> Array:
@@ -187,20 +190,27 @@ def _judge_shift(surface: np.ndarray, scale: int) -> Finding:
     return Finding(check, "wrong" if size >= SHIFT_WRONG else "warning", where, fix, numbers)
 
 
-def judge_jitter(checks: Sequence[JitterCheck], *, motion_wrong: bool, scale: int) -> list[Finding]:
-    """Findings about jitter: against references, from frame to frame, and the constant shift."""
+def _jittered(checks: Sequence[JitterCheck]) -> bool:
+    return max(np.abs(jitter).max() for check in checks for jitter in check.jitters) >= JITTERED
+
+
+def judge_against(checks: Sequence[JitterCheck], scale: int) -> tuple[Finding, Finding]:
+    """Findings about jitter and a constant shift, frames against references."""
     surfaces = np.sum([check.against for check in checks], axis=0)
-    jitters = np.concatenate([np.stack(check.jitters) for check in checks])
-    if not np.abs(jitters).max() >= 0.05:
-        no_jitter = [Finding(name, "not decidable", "the frames are not jittered") for name in ROWS[:2]]
-        return [*no_jitter, _judge_shift(surfaces[0], scale)]
+    if not _jittered(checks):
+        return Finding(ROWS[0], "not decidable", NO_JITTER), _judge_shift(surfaces[0], scale)
     against = _judge_range(checks) or _judge_against(surfaces)
-    if motion_wrong:
-        between = Finding(ROWS[1], "not decidable", "the motion is wrong", "put the motion right, then check again")
-    else:
-        between = judge(ROWS[1], [check.between for check in checks], FIXES, "the jitter hardly changes")
     if against.verdict == "wrong":
-        shift = Finding(ROWS[2], "not decidable", "the jitter is wrong", "put the jitter right, then check again")
-    else:
-        shift = _judge_shift(surfaces[0], scale)
-    return [against, between, shift]
+        fix = "put the jitter right, then check again"
+        return against, Finding(ROWS[2], "not decidable", "the jitter is wrong", fix)
+    return against, _judge_shift(surfaces[0], scale)
+
+
+def judge_between(checks: Sequence[JitterCheck], *, motion_wrong: bool) -> Finding:
+    """The finding about jitter from frame to frame."""
+    if not _jittered(checks):
+        return Finding(ROWS[1], "not decidable", NO_JITTER)
+    if motion_wrong:
+        fix = "put the motion right, then check again"
+        return Finding(ROWS[1], "not decidable", "the motion is wrong", fix)
+    return judge(ROWS[1], [check.between for check in checks], FIXES, "the jitter hardly changes")

@@ -137,14 +137,25 @@ def rendered_errors(step: Step, lookup: np.ndarray) -> np.ndarray:
     return np.asarray(warp_errors(step.before.color, step.now.color, lookup, zero, step.key, scale=1))[..., 0]
 
 
-def judge_motion(checks: Sequence[MotionCheck], info: SequenceInfo) -> list[Finding]:
-    """Findings about motion: against the references, and against the rendered frames."""
+def judge_motion(
+    checks: Sequence[MotionCheck], info: SequenceInfo, *, references_jittered: bool = False
+) -> list[Finding]:
+    """Findings about motion: against the references, and against the rendered frames.
+
+    Args:
+      checks: one per sequence.
+      info: of the dataset.
+      references_jittered: they look as jittered as the frames, so they cannot tell whether jitter is in the motion.
+    """
     fixes = {name: fix_of(name, info) for name in READINGS}
     still = f"the motion is < {DIFFERENT} px, or nothing is seen twice"
     against = judge(ROWS[0], [check.reference for check in checks], fixes, still, ignore=JITTERED)
     rendered = judge(ROWS[1], [check.rendered for check in checks], fixes, still)
     pixels = sum(check.pixels for check in checks)
     merged = MotionCheck(squares=np.sum([check.squares for check in checks], axis=0), pixels=pixels)
+    if references_jittered and against.fix in [fixes[name] for name in JITTERED]:
+        fix = "put the jitter right, then check again"
+        against = dataclasses.replace(against, verdict="not decidable", found="the references are jittered", fix=fix)
     if not merged.pixels:
         return [against, rendered]
     stated, none = merged.psnr
