@@ -120,6 +120,6 @@ CONVENTIONS = {
     "jitter negated": (jitter(lambda x, y: (-x, -y)), "jitter, references", "negate x and y at import"),
     "jitter x flipped": (jitter(lambda x, y: (-x, y)), "jitter, references", "jitter x has the wrong sign"),
     "jitter swapped": (jitter(lambda x, y: (y, x)), "jitter, references", "jitter x and y are swapped"),
-    "jitter lost": (jitter(lambda x, y: (0.9 * x - 0.5, y)), "jitter, references", "in [-0.5, 0.5)"),
+    "jitter out of range": (jitter(lambda x, y: (0.9 * x - 0.5, y)), "jitter, references", "in [-0.5, 0.5)"),
 }
 """Corruption, the row that must say "wrong", a part of its fix."""
