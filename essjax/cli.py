@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from essjax.data import PRESETS, Dataset, ImportReport, import_dataset, read_dataset
+from essjax.data import PRESETS, Dataset, ImportReport, import_dataset
 from essjax.data.check import CheckReport, check_dataset
-from essjax.data.layout import write_json
+from essjax.data.layout import read_dataset, write_json
 from essjax.generate import generate, plan
 
 _console = Console()
