@@ -1,4 +1,4 @@
-"""The ``essjax`` command: make and import datasets. ``essjax --help`` lists the commands."""
+"""The ``essjax`` command: make, import and check datasets. ``essjax --help`` lists the commands."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -8,10 +8,13 @@ from typing import Literal
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from essjax.data import Dataset, ImportReport, import_dataset
+from essjax.data.check import CheckReport, check_dataset
+from essjax.data.layout import read_dataset, write_json
 from essjax.generate import generate, plan
 
 _console = Console()
@@ -177,21 +180,64 @@ def import_(
     _print_report(report)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"scenes": scenes, "import": import_}
-"""Command name -> function; its arguments and docstring are the command's."""
+VERDICT_STYLES = {"ok": "green", "not decidable": "cyan", "warning": "yellow", "wrong": "bold red"}
+
+
+def _print_check(report: CheckReport, path: Path) -> None:
+    title = f"{path}: {report.verdict}; looked at {report.looked_at} of {report.frames} frames"
+    table = Table(title=title, title_justify="left")
+    for column in ("check", "verdict", "found"):
+        table.add_column(column)
+    for finding in report.findings:
+        style = VERDICT_STYLES[finding.verdict]
+        table.add_row(finding.check, f"[{style}]{finding.verdict}[/]", escape(finding.found))
+    _console.print(table)
+    fixes = {finding.fix: finding.check for finding in reversed(report.findings) if finding.fix}
+    for fix, name in reversed(fixes.items()):
+        _console.print(f"{name}: {fix}", markup=False, soft_wrap=True)
+
+
+def check(
+    dataset: tyro.conf.Positional[Path],
+    /,
+    pairs: int = 24,
+    json: Path | None = None,
+    pictures: Path | None = None,
+) -> int:
+    """Prove a dataset's conventions on its own pictures; exit code 1 if something is wrong.
+
+    Args:
+      dataset: The dataset's folder.
+      pairs: Pairs of neighbouring frames per sequence to look at, evenly spread; 0 for all.
+      json: Also write the findings to this file.
+      pictures: Also write pictures to this folder: the previous reference warped, the present one, the difference.
+    """
+    opened = read_dataset(dataset)
+    with progress_bar("checking") as progress:
+        report = check_dataset(opened, pairs=pairs, pictures=pictures, progress=progress)
+    _print_check(report, dataset)
+    if json is not None:
+        write_json(json, report.as_json())
+    for path in report.pictures:
+        _console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    return int(report.verdict == "wrong")
+
+
+COMMANDS: dict[str, Callable[..., int | None]] = {"scenes": scenes, "import": import_, "check": check}
+"""Command name -> function; its arguments and docstring are the command's. It may return an exit code."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; bad input prints one line and returns 2, Ctrl-C returns 130."""
     try:
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv)
+        code = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv)
     except ValueError as error:
         _console.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
         _console.print("interrupted; run the same command again to resume.")
         return 130
-    return 0
+    return code or 0
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from essjax.frames import Frame, Sequence, frame_images, gbuffers_of, select_tim
 
 MASKS = ("valid", "steady")
 FAST = {"compression": OpenEXR.RLE_COMPRESSION}
-"""Lossless in a third of ZIP's time, for about a quarter more disk (path-traced frames): an import is bound by it."""
+"""For imports, which ZIP would dominate: lossless in a third of its time, for a quarter more disk (path-traced frames)."""
 
 
 def _plain(content: Any) -> Any:
@@ -189,7 +189,7 @@ class SequenceWriter:
         frame, reference, native = jax.tree.map(np.asarray, (frame, reference, native))
         self._validate(number, frame, reference, native)
         self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
-        self.commit(self._write_images(number, frame, reference, masks, native, notes or {}))
+        self.commit(self._write_images(number, frame, reference, masks, native, notes or {}, {}))
 
     def prepare(
         self, number: int, frame: Frame, reference: Any, *, notes: Mapping[str, Any] | None = None
@@ -201,7 +201,7 @@ class SequenceWriter:
         """
         frame, reference = jax.tree.map(np.asarray, (frame, reference))
         self._validate(number, frame, reference, None)
-        return self._write_images(number, frame, reference, {}, None, notes or {})
+        return self._write_images(number, frame, reference, {}, None, notes or {}, FAST)
 
     def commit(self, prepared: PreparedFrame, *, cut: bool = False, save: bool = True) -> None:
         """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
@@ -243,15 +243,22 @@ class SequenceWriter:
             raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
 
     def _write_images(
-        self, number: int, frame: Frame, reference: np.ndarray, masks: Mapping, native: Frame | None, notes: Mapping
+        self,
+        number: int,
+        frame: Frame,
+        reference: np.ndarray,
+        masks: Mapping,
+        native: Frame | None,
+        notes: Mapping,
+        attributes: Mapping,
     ) -> PreparedFrame:
         described = self._describe(frame, reference, masks, native)
         (self.root / self.name).mkdir(parents=True, exist_ok=True)
-        clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}), attributes=FAST)
+        clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}), attributes=attributes)
         hr = {name: reference[..., i] for i, name in enumerate("RGB")}
-        clamped += exr.write(self._path("hr", number), hr, attributes=FAST)
+        clamped += exr.write(self._path("hr", number), hr, attributes=attributes)
         if native is not None:
-            clamped += exr.write(self._path("native", number), _planes(frame_images(native)), attributes=FAST)
+            clamped += exr.write(self._path("native", number), _planes(frame_images(native)), attributes=attributes)
         record = _plain({**_frame_record(number, frame, native), "notes": {**notes, "clamped": clamped}})
         return PreparedFrame(number, described, record)
 

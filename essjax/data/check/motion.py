@@ -1,0 +1,164 @@
+"""Motion: the picture before, warped as the dataset states it and as it could have been meant."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from essjax.data.check.compare import DIFFERENT, Comparison, judge
+from essjax.data.check.finding import Finding
+from essjax.data.check.pairs import Step
+from essjax.data.check.readings import JITTERED, NONE, READINGS, fix_of, jitter_step, motions_of
+from essjax.data.layout import SequenceInfo
+from essjax.typing import Array, Color, Image, Jitter, Motion
+from essjax.warp import backward_warp, hole_mask, inside_mask, upsample_motion
+
+ROWS = ("motion, references", "motion, rendered frames")
+
+
+class Look(NamedTuple):
+    """What the readings of one pair give.
+
+    Attributes:
+      motions: ``[N, H, W, 2]`` each reading's motion, pixels of the rendered frame; NaN if there is no such reading.
+      usable: ``[N, H, W]`` bool: inside the image, and not masked by the dataset.
+      reference: ``[N, H, W]`` absolute error of the warped reference, toned.
+      squares: ``[N, H, W]`` its squared error.
+      similarity: the best correlation of a warped reference with the present one; 1 if they are flat.
+    """
+
+    motions: np.ndarray
+    usable: np.ndarray
+    reference: np.ndarray
+    squares: np.ndarray
+    similarity: float
+
+
+def tone(image: Array, key: Array | float) -> Array:
+    """Radiance x as x / (x + key): errors count as an eye would count them, whatever the unit of radiance."""
+    return image / (image + key)
+
+
+def _blocks(image: Array, scale: int) -> Array:
+    """Means over blocks of ``scale``^2 pixels: ``[sH, sW]`` to ``[H, W]``."""
+    height, width = image.shape
+    return image.reshape(height // scale, scale, width // scale, scale).mean(axis=(1, 3))
+
+
+@partial(jax.jit, static_argnames="scale")
+def warp_errors(previous: Color, current: Color, motion: Motion, jitter: Jitter, key: Array, *, scale: int) -> Image:
+    """``[H, W, 3]``: absolute error, squared error and luminance of ``previous`` warped by LR ``motion``, toned."""
+    warped = tone(backward_warp(previous, upsample_motion(motion, scale, jitter=jitter)), key)
+    difference = warped - tone(current, key)
+    planes = (jnp.abs(difference), difference**2, warped)
+    return jnp.stack([_blocks(plane.mean(axis=-1), scale) for plane in planes], axis=-1)
+
+
+@jax.jit
+def _inside(motion: Motion) -> Array:
+    return inside_mask(motion)[..., 0] > 0
+
+
+@jax.jit
+def _holes(now, before, motion, jitter, jitter_before) -> Array:
+    return hole_mask(now, before, motion, jitter=jitter, jitter_previous=jitter_before)[..., 0] > 0
+
+
+def unoccluded(step: Step) -> np.ndarray:
+    """``[H, W]`` bool: where the frame before shows the same surface, from the dataset's masks or else its buffers."""
+    before, now = step.before, step.now
+    if step.exact or before is None:
+        return step.mask
+    return np.asarray(_holes(now.gbuffers, before.gbuffers, now.motion, now.jitter, before.jitter)) & step.mask
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-9))
+
+
+def look(step: Step) -> Look:
+    """Warp the reference before by every reading; the step must have a frame before."""
+    height, width = step.size
+    motions = np.stack(list(motions_of(step).values()))
+    known = np.isfinite(motions).all(axis=(1, 2, 3))
+    planes = np.full((len(READINGS), height, width, 3), np.nan, np.float32)
+    usable = np.zeros((len(READINGS), height, width), bool)
+    for index in np.flatnonzero(known):
+        motion = motions[index]
+        planes[index] = warp_errors(
+            step.reference_before, step.reference, motion, step.now.jitter, step.key, scale=step.scale
+        )
+        usable[index] = np.asarray(_inside(motion)) & step.mask
+    present = _blocks(tone(step.reference, step.key).mean(axis=-1), step.scale)
+    flat = present.std() < 1e-3
+    similarity = max(_correlation(planes[i, ..., 2], np.asarray(present)) for i in np.flatnonzero(known))
+    return Look(motions, usable, planes[..., 0], planes[..., 1], 1.0 if flat else similarity)
+
+
+@dataclasses.dataclass
+class MotionCheck:
+    """Sums over the pairs of one sequence."""
+
+    reference: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
+    rendered: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
+    squares: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
+    pixels: int = 0
+
+    def add(self, step: Step, looked: Look) -> None:
+        """Add a pair that is not a cut."""
+        assert step.before is not None
+        self.reference.add(looked.reference, looked.motions, looked.usable)
+        valid = unoccluded(step) & looked.usable[0]
+        self.squares += [looked.squares[0][valid].sum(), looked.squares[NONE][valid].sum()]
+        self.pixels += int(valid.sum())
+        lookups, usable = looked.motions + jitter_step(step), looked.usable.copy()
+        usable[[READINGS.index(name) for name in JITTERED]] = False
+        errors = np.zeros(usable.shape, np.float32)
+        for index in np.flatnonzero(usable.any(axis=(1, 2))):
+            errors[index] = rendered_errors(step, lookups[index])
+        self.rendered.add(errors, lookups, usable)
+
+    @property
+    def psnr(self) -> tuple[float, float]:
+        """Of the reference warped as stated and not at all, on pixels that the frame before shows, toned; dB."""
+        stated, none = -10 * np.log10(np.maximum(self.squares / max(self.pixels, 1), 1e-10))
+        return float(stated), float(none)
+
+
+def rendered_errors(step: Step, lookup: np.ndarray) -> np.ndarray:
+    """Absolute error ``[H, W]`` of the rendered frame before, read at pixel + ``lookup``, toned."""
+    assert step.before is not None
+    zero = np.zeros(2, np.float32)
+    return np.asarray(warp_errors(step.before.color, step.now.color, lookup, zero, step.key, scale=1))[..., 0]
+
+
+def judge_motion(
+    checks: Sequence[MotionCheck], info: SequenceInfo, *, references_jittered: bool = False
+) -> list[Finding]:
+    """Findings about motion: against the references, and against the rendered frames.
+
+    Args:
+      checks: one per sequence.
+      info: of the dataset.
+      references_jittered: they look as jittered as the frames, so they cannot tell whether jitter is in the motion.
+    """
+    fixes = {name: fix_of(name, info) for name in READINGS}
+    still = f"the motion is < {DIFFERENT} px, or nothing is seen twice"
+    against = judge(ROWS[0], [check.reference for check in checks], fixes, still, ignore=JITTERED)
+    rendered = judge(ROWS[1], [check.rendered for check in checks], fixes, still)
+    pixels = sum(check.pixels for check in checks)
+    merged = MotionCheck(squares=np.sum([check.squares for check in checks], axis=0), pixels=pixels)
+    if references_jittered and against.fix in [fixes[name] for name in JITTERED]:
+        fix = "put the jitter right, then check again"
+        against = dataclasses.replace(against, verdict="not decidable", found="the references are jittered", fix=fix)
+    if not merged.pixels:
+        return [against, rendered]
+    stated, none = merged.psnr
+    gain = {"psnr": round(stated, 2), "psnr_without_motion": round(none, 2), "gain": round(stated - none, 2)}
+    found = f"{against.found}; reference t-1 -> t {stated:.1f} dB, without motion {none:.1f} ({stated - none:+.1f} dB)"
+    return [dataclasses.replace(against, found=found, numbers={**gain, **against.numbers}), rendered]

@@ -1,0 +1,130 @@
+"""What the files hold: NaN, infinities, values out of range, channels that never change, colour that looks clipped."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from essjax.data.check.finding import Finding, some
+from essjax.data.check.pairs import Step
+from essjax.data.layout import SUFFIXES
+
+UNIT_RANGE = ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive")
+TOLERANCE = 1e-3
+"""By which a value may leave its range: half precision."""
+VARIES = ("color", "reference", "base_color", "normal", "depth", "world_position", "motion")
+"""Images of which every channel is expected to change; one roughness for a whole scene is nothing odd."""
+CLIPPED = (1.0, 255.0)
+"""Largest values that display-referred pictures have."""
+
+
+def channels_of(image: str, count: int) -> list[str]:
+    """``["motion.X", "motion.Y"]``; those of the reference are plain letters in its file."""
+    return [f"{image}.{suffix}" for suffix in SUFFIXES.get(image, "RGB")[:count]]
+
+
+@dataclasses.dataclass
+class ValuesCheck:
+    """Over the frames of one sequence.
+
+    Attributes:
+      bad: kind of defect -> channel -> frames.
+      low: channel -> smallest finite value.
+      high: channel -> largest finite value.
+      at_top: image -> values of colour and reference that are one of ``CLIPPED``.
+      pixels: image -> how many values there are.
+    """
+
+    bad: dict[str, dict[str, list[str]]] = dataclasses.field(default_factory=dict)
+    low: dict[str, float] = dataclasses.field(default_factory=dict)
+    high: dict[str, float] = dataclasses.field(default_factory=dict)
+    at_top: dict[str, int] = dataclasses.field(default_factory=dict)
+    pixels: dict[str, int] = dataclasses.field(default_factory=dict)
+
+    def add(self, step: Step) -> None:
+        """Look at the images of a frame as they are in the files."""
+        for image, values in step.raw.items():
+            for index, channel in enumerate(channels_of(image, values.shape[-1])):
+                self._add_plane(image, channel, np.asarray(values[..., index], np.float32), step.where)
+
+    def _add_plane(self, image: str, channel: str, plane: np.ndarray, where: str) -> None:
+        finite = plane[np.isfinite(plane)]
+        infinite = np.isneginf(plane).any() if image == "depth" else np.isinf(plane).any()
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.inf, -np.inf)
+        defects = {
+            "NaN": np.isnan(plane).any(),
+            "infinite": infinite,
+            "negative": image in ("color", "reference") and low < 0,
+            "out of [0, 1]": image in UNIT_RANGE and (low < -TOLERANCE or high > 1 + TOLERANCE),
+        }
+        for kind, found in defects.items():
+            if found:
+                self.bad.setdefault(kind, {}).setdefault(channel, []).append(where)
+        everywhere_finite = finite.size == plane.size
+        if not everywhere_finite and image == "depth" and finite.size:
+            high = np.inf  # some background: the channel changes
+        self.low[channel] = min(self.low.get(channel, np.inf), low)
+        self.high[channel] = max(self.high.get(channel, -np.inf), high)
+        if image in ("color", "reference"):
+            self.at_top[image] = self.at_top.get(image, 0) + int(np.isin(finite, CLIPPED).sum())
+            self.pixels[image] = self.pixels.get(image, 0) + plane.size
+
+
+_FIXES = {
+    "NaN": "find what makes them in the renderer, or set them to 0 at import and mark the pixels as reactive",
+    "infinite": "clamp radiance at import (half holds 65504); only the background's depth is +inf",
+    "negative": "clamp at 0 at import: filters with negative lobes and denoisers make them",
+    "out of [0, 1]": "is the channel in [0, 255], or another one? Scale or clamp it at import",
+}
+
+
+def _judge_defects(checks: Sequence[ValuesCheck]) -> Finding:
+    for kind, fix in _FIXES.items():
+        channels: dict[str, list[str]] = {}
+        for check in checks:
+            for channel, places in check.bad.get(kind, {}).items():
+                channels.setdefault(channel, []).extend(places)
+        if channels:
+            places = list(dict.fromkeys(where for found in channels.values() for where in found))
+            found = f"{kind}: {some(channels)} in {len(places)} frames ({some(places)})"
+            return Finding("values", "wrong", found, fix, {channel: len(found) for channel, found in channels.items()})
+    return Finding("values", "ok", "finite and in range")
+
+
+def _extremes(checks: Sequence[ValuesCheck]) -> dict[str, tuple[float, float]]:
+    channels = checks[0].low
+    return {c: (min(check.low[c] for check in checks), max(check.high[c] for check in checks)) for c in channels}
+
+
+def _judge_constant(checks: Sequence[ValuesCheck]) -> Finding:
+    check, extremes = "constant channels", _extremes(checks)
+    constant = {c: low for c, (low, high) in extremes.items() if low == high or low > high}
+    values = [f"{channel} = {value:.3g}" for channel, value in constant.items()]
+    suspicious = [channel for channel in constant if channel.rpartition(".")[0] in VARIES]
+    if any(channel.startswith(("color", "reference")) for channel in suspicious):
+        return Finding(
+            check, "wrong", some(values), "is the right channel imported, and was the pass rendered?", constant
+        )
+    if suspicious:
+        return Finding(
+            check, "warning", some(values), "is the right channel imported, and was the pass rendered?", constant
+        )
+    return Finding(check, "ok", f"only {some(values)}" if values else "none", "", constant)
+
+
+def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
+    check, extremes = "colour scale", _extremes(checks)
+    for image in ("color", "reference"):
+        high = max(extremes[channel][1] for channel in channels_of(image, 3))
+        share = sum(c.at_top[image] for c in checks) / sum(c.pixels[image] for c in checks)
+        if high in CLIPPED and share > 1e-4:
+            found = f"{image} never exceeds {high:g} and is exactly that in {share:.1%} of its values: it looks clipped"
+            fix = "import linear HDR radiance from before tone mapping; if this is 8-bit sRGB, say so at import"
+            return Finding(check, "warning", found, fix, {"max": high, "share": round(share, 4)})
+    high = max(extremes[channel][1] for channel in channels_of("color", 3))
+    return Finding(check, "ok", f"radiance up to {high:.3g}", "", {"max": high})
+
+
+def judge_values(checks: Sequence[ValuesCheck]) -> list[Finding]:
+    """Findings about values, constant channels and the scale of colour."""
+    return [_judge_defects(checks), _judge_constant(checks), _judge_scale(checks)]
