@@ -32,7 +32,7 @@ from essjax.frames import Frame, Sequence, frame_images, gbuffers_of, select_tim
 
 MASKS = ("valid", "steady")
 FAST = {"compression": OpenEXR.RLE_COMPRESSION}
-"""For imports, which ZIP would dominate: lossless in a third of its time, for a quarter more disk (path-traced frames)."""
+"""For imports, which ZIP would dominate: lossless in a third of its time, for a quarter more disk (path-traced)."""
 
 
 def _plain(content: Any) -> Any:
