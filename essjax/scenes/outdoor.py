@@ -179,7 +179,10 @@ def plaza(b: Builder) -> None:
     )
     b.sun(sun, (8.0, 5.4, 3.4))
     angle = swing(b, 0.5, rng.uniform(0.04, 0.055))
-    eye = path(7.2 * np.sin(angle), 1.7 + swing(b, 0.3, 0.012), 7.2 * np.cos(angle) + swing(b, 0.8, 0.04))
+    height = 1.7 + swing(b, 0.3, 0.012)
+    eye = path(7.2 * np.sin(angle), height, 7.2 * np.cos(angle) + swing(b, 0.8, 0.04))
+    # The houses begin at 7.5 m: no further out, or the camera stands inside one.
+    eye[:, ::2] *= np.minimum(1.0, 7.3 / np.hypot(eye[:, 0], eye[:, 2]))[:, None]
     b.set_camera(eye, path(0.7 * eye[:, 0], 1.6, -2.0), focal=rng.uniform(0.75, 0.9))
 
 
