@@ -1,10 +1,12 @@
-"""BENCHMARKS.md from ``experiments/results/*.json``: ``python -m experiments.benchmarks_page [metrics.json ...]``.
+"""BENCHMARKS.md from ``experiments/results/*.json``.
 
-Given metrics files of runs, it first copies their means into ``experiments/results``; then it writes the page.
+``python -m experiments.benchmarks_page`` writes the page; ``... NAME METRICS.json [METRICS.json ...]`` first keeps a run, or
+the same run with several seeds, as ``experiments/results/NAME.json``.
 """
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +25,53 @@ mean over test sequences of one run; PSNR in dB after x/(1+x) and sRGB. SS: rend
 """
 
 
-def keep(metrics_path: Path, name: str | None = None) -> Path:
-    """Copy the mean rows of a run's ``metrics.json`` into the results folder; returns the file."""
-    metrics = json.loads(metrics_path.read_text())
-    if metrics.get("schema") != 1:
-        raise ValueError(f"{metrics_path}: expected schema 1, got {metrics.get('schema')!r}.")
-    metrics["rows"] = [row for row in metrics["rows"] if row["sequence"] == "mean"]
-    path = RESULTS / f"{name or metrics_path.resolve().parent.name}.json"
-    path.write_text(json.dumps(metrics, indent=1) + "\n")
+def keep(name: str, paths: Sequence[Path]) -> Path:
+    """Keep the mean rows of runs that differ in their seed as ``NAME.json`` in the results folder; returns the file.
+
+    Each metric becomes the mean over runs, with ``<metric>_range``: half of the distance between best and worst.
+
+    Raises:
+      ValueError: a file of another schema, or runs that differ in more than the seed.
+    """
+    runs = [json.loads(path.read_text()) for path in paths]
+    for path, run in zip(paths, runs, strict=True):
+        if run.get("schema") != 1:
+            raise ValueError(f"{path}: expected schema 1, got {run.get('schema')!r}.")
+        for field in ("variant", "preset", "dataset"):
+            if run[field] != runs[0][field]:
+                raise ValueError(
+                    f"{path}: expected the {field} of {paths[0]}, {runs[0][field]!r}, got {run[field]!r}. Give runs "
+                    "that differ in their seed only."
+                )
+    merged = {**runs[0], "rows": _merge_rows(runs)}
+    if len(runs) > 1:
+        environments = [run["environment"] for run in runs]
+        parts = ("commit", "seed", "steps")
+        merged["environment"] = {**environments[0], **{part: [e[part] for e in environments] for part in parts}}
+        merged["seconds"] = {
+            part: round(sum(run["seconds"][part] for run in runs) / len(runs), 1) for part in runs[0]["seconds"]
+        }
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps(merged, indent=1) + "\n")
     return path
+
+
+def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of the mean over sequences, averaged over runs."""
+    labels = ("method", "frames", "resolution")
+    tables = [
+        {tuple(row[label] for label in labels): row for row in run["rows"] if row["sequence"] == "mean"} for run in runs
+    ]
+    merged = []
+    for key, first in tables[0].items():
+        row = dict(first)
+        for column in COLUMNS:
+            values = [table[key].get(column) for table in tables if key in table]
+            if len(values) > 1 and all(value is not None for value in values):
+                row[column] = sum(values) / len(values)
+                row[f"{column}_range"] = (max(values) - min(values)) / 2
+        merged.append(row)
+    return merged
 
 
 def page(results: list[tuple[str, dict[str, Any]]]) -> str:
@@ -64,14 +104,18 @@ def _import_section(name: str, metrics: dict[str, Any]) -> str:
 
 def _section(name: str, metrics: dict[str, Any]) -> str:
     environment = metrics["environment"]
-    steps = ", ".join(f"{stage} {count}" for stage, count in environment["steps"].items())
+    seeds, commits, counts = (_as_list(environment[part]) for part in ("seed", "commit", "steps"))
+    steps = "; ".join(", ".join(f"{stage} {count}" for stage, count in run.items()) or "none" for run in counts)
+    seed = (
+        f"seed {seeds[0]}" if len(seeds) == 1 else f"mean ± half the range over the seeds {', '.join(map(str, seeds))}"
+    )
     versions = environment["versions"]
     lines = [
         f"## {name}",
         "",
         f"`--variant {metrics['variant']} --preset {metrics['preset']}`; {metrics['dataset']}.",
-        f"Commit {environment['commit']}; {environment['device']}; jax {versions['jax']}, Python {versions['python']}; "
-        f"seed {environment['seed']}; steps: {steps or 'none'}.",
+        f"Commit {', '.join(dict.fromkeys(commits))}; {environment['device']}; jax {versions['jax']}, Python "
+        f"{versions['python']}; {seed}; steps: {steps}.",
         "Seconds: " + ", ".join(f"{part} {value:g}" for part, value in metrics["seconds"].items()) + ".",
         "",
     ]
@@ -94,7 +138,11 @@ def _number(value: float | None, column: str) -> str:
 
 def _spread(row: dict[str, Any], column: str) -> str:
     spread = row.get(f"{column}_range")
-    return "" if spread is None else f" ± {_number(spread, column)}"
+    return f" ± {_number(spread, column)}" if spread else ""
+
+
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 def current() -> str:
@@ -103,6 +151,8 @@ def current() -> str:
 
 
 if __name__ == "__main__":
-    for argument in sys.argv[1:]:
-        keep(Path(argument))
+    if len(sys.argv) > 2:
+        keep(sys.argv[1], [Path(argument) for argument in sys.argv[2:]])
+    elif len(sys.argv) == 2:
+        sys.exit(__doc__)
     PAGE.write_text(current())

@@ -9,24 +9,40 @@ def test_the_page_is_current():
     assert benchmarks_page.PAGE.read_text() == benchmarks_page.current(), "run python -m experiments.benchmarks_page"
 
 
-def test_a_result_becomes_a_table(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
-    row = {"method": "jau", "frames": "ss", "resolution": "hr", "psnr": 23.456, "psnr_range": 0.12, "ssim": 0.71239}
-    environment = {"commit": "abc", "device": "cpu", "seed": 0, "steps": {"a": 3}}
+def run(folder, psnr, **changes):
+    """A ``metrics.json`` with one row, of the given PSNR."""
+    row = {"method": "jau", "frames": "ss", "resolution": "hr", "psnr": psnr, "ssim": 0.71239, "tpsnr": None}
+    environment = {"commit": "abc", "device": "cpu", "seed": changes.pop("seed", 0), "steps": {"a": 3}}
     environment["versions"] = {"jax": "1", "python": "3"}
     metrics = {
         "schema": 1, "variant": "extrass", "preset": "quick", "dataset": "d", "environment": environment,
-        "seconds": {"data": 2.0}, "rows": [{**row, "sequence": "mean"}, {**row, "sequence": "one"}],
+        "seconds": {"data": 2.0}, "rows": [{**row, "sequence": "mean"}, {**row, "sequence": "one"}], **changes,
     }  # fmt: skip
-    (tmp_path / "run").mkdir()
-    source = tmp_path / "run" / "metrics.json"
-    source.write_text(json.dumps(metrics))
-    kept = json.loads(benchmarks_page.keep(source).read_text())
+    folder.mkdir()
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder / "metrics.json"
+
+
+def test_a_result_becomes_a_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
+    kept = json.loads(benchmarks_page.keep("one", [run(tmp_path / "run", 23.456)]).read_text())
     assert [r["sequence"] for r in kept["rows"]] == ["mean"]
-    assert "| jau | SS | 23.46 ± 0.12 | 0.712 |" in benchmarks_page.current()
-    source.write_text(json.dumps({**metrics, "schema": 2}))
+    assert "| jau | SS | 23.46 | 0.712 |" in benchmarks_page.current() and "seed 0;" in benchmarks_page.current()
     with pytest.raises(ValueError, match="expected schema 1, got 2"):
-        benchmarks_page.keep(source)
+        benchmarks_page.keep("two", [run(tmp_path / "newer", 1.0, schema=2)])
+
+
+def test_runs_with_several_seeds_become_mean_and_range(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
+    paths = [run(tmp_path / str(seed), psnr, seed=seed) for seed, psnr in enumerate((23.0, 24.0, 23.2))]
+    row = json.loads(benchmarks_page.keep("three", paths).read_text())["rows"][0]
+    assert row["psnr"] == pytest.approx(23.4) and row["psnr_range"] == pytest.approx(0.5)
+    assert row["ssim_range"] == 0 and "tpsnr_range" not in row
+    text = benchmarks_page.current()
+    assert "| jau | SS | 23.40 ± 0.50 | 0.712 |" in text
+    assert "seeds 0, 1, 2; steps: a 3; a 3; a 3." in text and "Commit abc;" in text
+    with pytest.raises(ValueError, match="expected the dataset of .* 'd', got 'other'"):
+        benchmarks_page.keep("mixed", [paths[0], run(tmp_path / "other", 1.0, dataset="other")])
 
 
 def test_the_import_benchmark_measures_what_it_says(tmp_path, monkeypatch):
