@@ -1,7 +1,7 @@
 """BENCHMARKS.md from ``experiments/results/*.json``.
 
-``python -m experiments.benchmarks_page`` writes the page; ``... NAME METRICS.json [METRICS.json ...]`` first keeps a run, or
-the same run with several seeds, as ``experiments/results/NAME.json``.
+``python -m experiments.benchmarks_page`` writes the page; ``... NAME METRICS.json [METRICS.json ...]`` first keeps a
+run, or the same run with several seeds, as ``experiments/results/NAME.json``.
 """
 
 import json
