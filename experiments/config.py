@@ -74,7 +74,7 @@ PRESETS: dict[str, Config] = {
         frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None, seconds=None, save_every=300.0, pictures=2,
     ),
 }  # fmt: skip
-"""smoke: every part runs once, two minutes of compilation. quick: the default, ten minutes on two cores. paper: the
+"""smoke: every part runs once, under a minute on two cores. quick: the default, seven minutes. paper: the
 papers' settings (an epoch: one crop from each of 120 sequences' 60 frames, 900 batches of 8 or 600 of 12)."""
 
 PRESET_NAMES = tuple(PRESETS)
