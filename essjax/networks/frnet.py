@@ -1,11 +1,14 @@
 """FRNet: flow that moves shading which geometry does not explain (ExtraSS section 4.3, eq 4).
 
 The supplementary with its layers is not public. Ours is a coarse-to-fine flow decoder over a 3-level encoder as in
-IFRNet (Kong et al. 2022), whose feature loss eq 8 follows; see docs/deviations.md.
+IFRNet (Kong et al. 2022), whose feature loss eq 8 follows; it corrects a flow found by matching on smooth surfaces,
+where mirror images and highlights move. See docs/deviations.md.
 """
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from essjax.interfaces import Network
 from essjax.networks.blocks import ConvBlock, bilinear_upsample, conv, crop, mean_pool, pad_to_multiple, zero_conv
@@ -14,6 +17,48 @@ from essjax.typing import Image, Plane
 from essjax.warp import backward_warp
 
 LEVELS = 3
+OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-1.0, 1.5, 0.5)]), axis=-1).reshape(-1, 2).astype(np.float32)
+"""Flows that ``matched_flow`` tries, (x, y) half-size pixels per rendered frame."""
+PATCH = 7
+"""Side of the squares whose match is judged, half-size pixels."""
+TEMPERATURE = 0.003
+"""Difference of costs (log1p radiance) that matters."""
+COST_PER_PIXEL, SMOOTH, COST_OF_ROUGHNESS = 0.005, 0.25, 100.0
+"""Cost of a flow's length, and how it grows with roughness beyond ``SMOOTH``: shading of rough surfaces stays there."""
+
+
+def matched_flow(warped: Image, roughness: Plane) -> Image:
+    """Where shading that moves evenly came from, by matching the two warped frames; nothing to learn.
+
+    What is at x now was at x + f one rendered frame ago and at x + 3 f two rendered frames ago. Every f of ``OFFSETS``
+    is judged by the mean absolute difference over a square, and the mean weighted by a softmax is taken.
+
+    Args:
+      warped: the newest and the older frame, warped by geometry, log1p, ``[2, ..., h, w, 3]``.
+      roughness: ``[..., h, w, 1]``.
+
+    Returns:
+      Flow to the newest frame, ``[..., h, w, 2]`` pixels of this size; no gradient.
+    """
+    newest, older = jax.lax.stop_gradient(warped)
+    price = COST_PER_PIXEL * (1.0 + COST_OF_ROUGHNESS * jnp.maximum(roughness - SMOOTH, 0.0))[..., 0]
+
+    def cost(offset: jax.Array) -> jax.Array:
+        flow = jnp.broadcast_to(offset, (*newest.shape[:-1], 2))
+        difference = jnp.mean(jnp.abs(backward_warp(newest, flow) - backward_warp(older, 3.0 * flow)), axis=-1)
+        return _box(difference) + price * jnp.linalg.norm(offset)
+
+    costs = jax.lax.map(cost, jnp.asarray(OFFSETS, newest.dtype))
+    weights = jax.nn.softmax(-costs / TEMPERATURE, axis=0)
+    return jax.lax.stop_gradient(jnp.tensordot(jnp.moveaxis(weights, 0, -1), jnp.asarray(OFFSETS), axes=1))
+
+
+def _box(values: jax.Array) -> jax.Array:
+    """Mean over ``PATCH`` x ``PATCH`` of ``[..., h, w]``, borders replicated."""
+    lead, reach = values.ndim - 2, PATCH // 2
+    padded = jnp.pad(values, [(0, 0)] * lead + [(reach, reach)] * 2, mode="edge")
+    window = (1,) * lead + (PATCH, PATCH)
+    return jax.lax.reduce_window(padded, 0.0, jax.lax.add, window, (1,) * padded.ndim, "VALID") / PATCH**2
 
 
 class FRNet(nn.Module):
@@ -59,20 +104,26 @@ class FRNet(nn.Module):
         hints = [pad_to_multiple(roughness, 2 ** (LEVELS - 1))]
         for _ in range(LEVELS - 1):
             hints.append(mean_pool(hints[-1]))
-        flows = jnp.zeros((*encoded[-1].shape[:-1], 2), warped.dtype)  # [2, ...]: to the newest, to the older frame
+        matched = [matched_flow(pad_to_multiple(warped, 2 ** (LEVELS - 1)), hints[0])]
+        for _ in range(LEVELS - 1):
+            matched.append(0.5 * mean_pool(matched[-1]))
+        flows = jnp.zeros(
+            (*encoded[-1].shape[:-1], 2), warped.dtype
+        )  # [2, ...]: corrections for newest and older frame
         coarser: list[Image] = []
         features: list[Image] = []
         for level in reversed(range(LEVELS)):
             if level < LEVELS - 1:
                 flows = 2.0 * bilinear_upsample(flows)
                 coarser = [bilinear_upsample(features[-1])]
-            newest, older = backward_warp(encoded[level], flows)
+            total = flows + jnp.stack([matched[level], 3.0 * matched[level]])
+            newest, older = backward_warp(encoded[level], total)
             x = self.decoders[level](
-                jnp.concatenate([newest, older, *coarser, flows[0], flows[1], hints[level]], axis=-1)
+                jnp.concatenate([newest, older, *coarser, total[0], total[1], hints[level]], axis=-1)
             )
             flows = flows + jnp.stack(jnp.split(self.to_flow[level](x), 2, axis=-1))
             features.append(self.to_features[level](x))
-        return {"flow": crop(flows[0], height, width), "features": features[::-1]}
+        return {"flow": crop(matched[0] + flows[0], height, width), "features": features[::-1]}
 
 
 def frnet(width: int = 16) -> Network:
