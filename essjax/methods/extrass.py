@@ -35,11 +35,8 @@ from essjax.warp import (
     space_to_depth,
     upsample_motion,
 )
+from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
 
-SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
-"""Standard deviations of base colour and normal in eq 2; not in the paper, chosen on validation data."""
-SIGMA_DISTANCE = 2.0
-"""Standard deviation of the screen distance in eq 2, LR pixels; likewise."""
 RATIO_FLOOR = 0.02
 """Radiance added to both sides of FRNet's change of shading, so that black stays black."""
 REFINE_DELTA = 0.1

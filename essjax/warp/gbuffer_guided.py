@@ -21,7 +21,7 @@ STRIDES = (1, 3, 5, 9)
 WINNERS = 4
 SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
 """Base colour, normal: a starting value measured on a path-traced clip; the paper gives none."""
-SIGMA_DISTANCE = 4.0
+SIGMA_DISTANCE = 2.0
 _ID_MASK = 63  # 6 bits hold a candidate's number
 _UNUSABLE = np.int32(0x7F800000)  # bits of +inf: above the key of every finite cost
 _REACH = max(STRIDES)

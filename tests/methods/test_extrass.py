@@ -137,13 +137,14 @@ def test_blend_mask_equals_numpy():
     assert 0.1 < expected.mean() < 0.9 and undecided.mean() < 0.02
 
 
-def test_untrained_refinement_keeps_the_warp():
+def test_untrained_refinement_keeps_the_warp_of_rough_surfaces():
     network = frnet(4)
     frames = random_frames()
-    warped = random_image(5, 2, B, H, W, 3, high=8.0)
+    frames = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, roughness=None))  # counts as 1
+    warped = 1.0 + random_image(5, 2, B, H, W, 3, high=0.1)
     variables = network.init(jax.random.key(0), jnp.zeros((2, B, 8, 11, 3)), jnp.zeros((B, 8, 11, 1)))
     result = jax.jit(lambda *arguments: refine(network, *arguments))(variables, warped, select_time(frames.gbuffers, 0))
-    np.testing.assert_array_equal(result["flow"], 0.0)
+    np.testing.assert_allclose(result["flow"], 0.0, atol=1e-6)
     np.testing.assert_array_equal(result["mask"], 0.0)
     np.testing.assert_array_equal(result["image"], warped[0])
 

@@ -12,6 +12,7 @@ from essjax.frames import select_time
 from essjax.methods import extrass
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, pad_to_multiple
+from essjax.networks.frnet import matched_flow
 from tests.helpers import make_frames, random_image
 
 
@@ -84,15 +85,35 @@ def test_frnet_on_odd_sizes(small_frnet):
     run = jax.jit(lambda v, *inputs: network.apply(v, *inputs)[0])
     untrained = run(variables, warped, roughness)
     assert untrained["flow"].shape == (2, 7, 11, 2)
-    np.testing.assert_array_equal(untrained["flow"], 0.0)
+    matched = matched_flow(pad_to_multiple(warped, 4), pad_to_multiple(roughness, 4))
+    np.testing.assert_allclose(untrained["flow"], crop(matched, 7, 11), atol=1e-5)
     assert [f.shape for f in untrained["features"]] == [(2, 8, 12, 4), (2, 4, 6, 6), (2, 2, 3, 8)]
 
     trained = run(randomised(variables), warped, roughness)
-    assert float(jnp.abs(trained["flow"]).max()) > 1e-3
+    assert float(jnp.abs(trained["flow"] - untrained["flow"]).max()) > 1e-3
     padded = run(randomised(variables), pad_to_multiple(warped, 4), pad_to_multiple(roughness, 4))
     np.testing.assert_allclose(trained["flow"], crop(padded["flow"], 7, 11), rtol=1e-4, atol=1e-5)
     encoded, state = network.apply(variables, random_image(2, 2, 7, 11, 3), method="encode")
     assert [f.shape for f in encoded] == [f.shape for f in untrained["features"]] and state == {}
+
+
+@pytest.mark.parametrize("flow", [(1, 0), (0, 1), (-1, 1)])
+def test_matching_finds_shading_that_moves_evenly(flow):
+    """A picture that moved by whole pixels, on a mirror (left half) and on a rough surface (right half)."""
+    picture = 0.2 * np.asarray(random_image(4, 40, 40, 3, high=1.0))
+    y, x = np.mgrid[8:32, 8:32]
+    # newest(x + f) = older(x + 3 f) = what is seen now.
+    warped = jnp.stack([jnp.asarray(picture[y - k * flow[1], x - k * flow[0]]) for k in (1, 3)])
+    roughness = jnp.where(jnp.arange(24) < 12, 0.1, 0.9)[None, :, None] * jnp.ones((24, 24, 1))
+    found = np.asarray(jax.jit(matched_flow)(warped, roughness))
+    np.testing.assert_allclose(found[8:16, 8:11], np.broadcast_to(flow, (8, 3, 2)), atol=0.02)
+    np.testing.assert_allclose(found[:, 12:], 0.0, atol=1e-4)
+
+
+def test_matching_of_equal_frames_finds_no_motion():
+    image = random_image(5, 12, 16, 3)
+    found = matched_flow(jnp.stack([image, image]), jnp.zeros((12, 16, 1)))
+    np.testing.assert_allclose(found[4:8, 4:12], 0.0, atol=1e-3)
 
 
 def test_extrassnet_on_odd_sizes():
@@ -106,7 +127,7 @@ def test_extrassnet_on_odd_sizes():
         return [output for output, _ in outputs]
 
     for head, features in run(variables, ss, ess):
-        assert head.shape == (2, 9, 13, 16)
+        assert head.shape == (2, 9, 13, 20)
         np.testing.assert_array_equal(head, 0.0)
         assert [f.shape for f in features] == [(2, 16, 16, 4), (2, 8, 8, 6), (2, 4, 4, 8), (2, 2, 2, 12)]
     variables = randomised(variables)

@@ -24,7 +24,7 @@ def scene(seed, motion_size=4.0, height=H, width=W):
     return radiance, guide_previous, guide, rng.normal(0, motion_size, (height, width, 2)).astype(np.float32)
 
 
-def oracle(radiance, guide_previous, guide, motion, sigma_guide=SIGMAS, sigma_distance=4.0):
+def oracle(radiance, guide_previous, guide, motion, sigma_guide=SIGMAS, sigma_distance=2.0):
     """ExtraSS eq 1-3 as written, pixel by pixel in float64, and by how much the choice of the four was clear."""
     height, width = motion.shape[:2]
     order = [(0, 0)]
