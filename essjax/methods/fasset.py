@@ -64,7 +64,7 @@ def fasset(
     *,
     scale: float = 2,
     width: int = 24,
-    hidden: int = 128,
+    hidden: int | None = None,
     gencoder: bool = True,
     mask_rendered: bool = True,
     shared: bool = True,
@@ -79,7 +79,7 @@ def fasset(
     Args:
       scale: output size over input size, any positive number; output sizes are rounded.
       width: channels of each of the two feature maps.
-      hidden: neurons of RenderINR's layers.
+      hidden: neurons of RenderINR's layers; None: 16/3 of the width, 128 at 24.
       gencoder: False feeds RenderINR the G-buffers themselves (Table 4, "- GEncoder").
       mask_rendered: False leaves rendered frames whole (Table 4, "- Additional mask").
       shared: False gives each task a FrameEncoder of its own (Table 4, "- Shared weights").
@@ -89,6 +89,7 @@ def fasset(
     """
     if not scale > 0:
         raise ValueError(f"scale: expected a positive number, got {scale!r}.")
+    hidden = width * 16 // 3 if hidden is None else hidden
     network = networks.fasset(scale, width=width, hidden=hidden, gencoder=gencoder, shared=shared)
     removed = {"no-gencoder": not gencoder, "no-mask": not mask_rendered, "no-sharing": not shared}
     name = "-".join(["fasset", *(part for part, absent in removed.items() if absent)])
@@ -101,16 +102,18 @@ def fasset(
 
     def start(example: Frame) -> History:
         size = example.motion.shape[:-1]
-        surfaces = _surfaces(example.gbuffers)
+        copied = lambda: jax.tree.map(jnp.copy, (_surfaces(example.gbuffers), example.jitter))  # noqa: E731
+        # No array twice: streaming donates the history.
+        (rendered, rendered_jitter), (gbuffers, jitter) = copied(), copied()
         return History(
             color=jnp.zeros((*size, 3), jnp.float32),
             hidden=jnp.zeros((*size, width), jnp.float32),
-            rendered=surfaces,
-            rendered_jitter=example.jitter,
+            rendered=rendered,
+            rendered_jitter=rendered_jitter,
             motion=jnp.zeros_like(example.motion),
             valid=jnp.ones((*size, 1), jnp.float32),
-            gbuffers=jax.tree.map(jnp.copy, surfaces),  # no buffer twice: streaming donates the history
-            jitter=jnp.copy(example.jitter),
+            gbuffers=gbuffers,
+            jitter=jitter,
             depth_scale=depth_scale(example.gbuffers),
             empty=jnp.ones(example.cut.shape, bool),
         )
@@ -154,7 +157,7 @@ def fasset(
         recent = jnp.where(expand_flag(history.empty, recent.ndim), 1.0, recent)  # nothing was warped: no holes
         mask = recent if mask_rendered else jnp.ones_like(recent)
         log_image, state = predict(
-            variables, history, frame, mask * color, mask, warped[..., 3:], train=train, task="render"
+            variables, history, frame, jnp.where(mask > 0, color, 0.0), mask, warped[..., 3:], train=train, task="render"
         )
         history = dataclasses.replace(
             history,
