@@ -16,7 +16,7 @@ def finished(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr(variants, "BASELINES", ("extrass-w", "bilinear"))
     patch.setattr(datasets, "plan", functools.partial(datasets.plan, families=["carousel"]))
-    overrides = ["test_frames=7", "train_frames=5", "frnet_steps=2", "steps=2", "size=[32,24]", "crop=[32,24]"]
+    overrides = ["test_frames=7", "train_frames=5", "first_steps=2", "steps=2", "size=[32,24]", "crop=[32,24]"]
     code = run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides])
     yield out, code, overrides
     patch.undo()
@@ -83,7 +83,7 @@ def test_bad_arguments_are_one_line(arguments, message, tmp_path, capsys):
 
 def test_a_crop_that_is_too_small(finished, tmp_path, capsys):
     out, _, _ = finished
-    settings = ["crop=[32,16]", "frnet_steps=1", "steps=1"]
+    settings = ["crop=[32,16]", "first_steps=1", "steps=1"]
     arguments = ["--preset", "smoke", "--data", str(out / "scenes"), "--out", str(tmp_path / "out"), "--set", *settings]
     assert run.main(arguments) == 2
     assert "crop: expected at least 24x24 LR pixels" in capsys.readouterr().out.replace("\n", " ")
