@@ -86,9 +86,8 @@ def _owner(row: str, names: Sequence[str], trained: Mapping[str, Trained]) -> st
     """The trained variant whose variables ``row`` runs with; None for a heuristic."""
     if trained_as(row) in trained:
         return trained_as(row)
-    return next(
-        (trained_as(name) for name in names if row in VARIANTS[name].parts and trained_as(name) in trained), None
-    )
+    whole = (trained_as(name) for name in names if row in VARIANTS[name].parts)
+    return next((name for name in whole if name in trained), None)
 
 
 def unfit(method: Method, sequence: FrameSequence) -> str:

@@ -11,7 +11,7 @@ import optax
 from essjax.frames import Sequence
 from essjax.train.objectives import Objective
 from essjax.train.state import TrainState, split_statistics
-from essjax.typing import Array, Callable
+from essjax.typing import Array, Callable, PyTree
 
 
 def make_train_step(
@@ -47,7 +47,8 @@ def make_train_step(
         finite = jnp.isfinite(total) & jnp.isfinite(norm)
         updates, new_optimizer = transform.update(gradient, state.optimizer, weights)
         updates = jax.tree.map(lambda update: -learning_rate * update, updates)
-        new_entry = {**statistics, **new_statistics, **optax.apply_updates(weights, updates)}
+        new_weights: PyTree = optax.apply_updates(weights, updates)
+        new_entry = {**statistics, **new_statistics, **new_weights}
         new = (new_entry, new_optimizer)
         old = (state.variables[trained], state.optimizer)
         entry, new_optimizer = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)

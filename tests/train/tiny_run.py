@@ -60,7 +60,8 @@ def run(folder, *, budget=None, save_every=1e9, on_step=lambda step, progress, t
     try:
         return train(
             tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
-            budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), save_every=save_every, on_step=on_step,
+            budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), save_every=save_every,
+            on_step=on_step,
         )  # fmt: skip
     finally:
         checkpoints.close()
