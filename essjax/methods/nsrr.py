@@ -60,9 +60,7 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True) -> Method:
 
     def start(example: Frame) -> History:
         content = jnp.zeros((*example.motion.shape[:-1], FEATURES), jnp.float32)
-        return History(
-            rendered=start_memory(example, content, PREVIOUS), depth_scale=depth_scale(example.gbuffers)
-        )
+        return History(rendered=start_memory(example, content, PREVIOUS), depth_scale=depth_scale(example.gbuffers))
 
     def init(key, example):
         *lead, height, wide, _ = example.motion.shape
