@@ -4,9 +4,10 @@
 the single metrics take images that already are display-referred, with any leading axes.
 """
 
+from essjax.losses import ssim_map
 from essjax.metrics.psnr import MAX_PSNR, psnr
 from essjax.metrics.score import METRICS, MIN_HOLE_PIXELS, aggregate, score_rollout
-from essjax.metrics.ssim import ssim, ssim_map
+from essjax.metrics.ssim import ssim
 from essjax.metrics.temporal import flicker, tpsnr, warped_error
 
 __all__ = [

@@ -2,5 +2,6 @@
 
 from essjax.networks.extrassnet import extrassnet
 from essjax.networks.frnet import frnet
+from essjax.networks.nsrr import nsrr
 
-__all__ = ["extrassnet", "frnet"]
+__all__ = ["extrassnet", "frnet", "nsrr"]
