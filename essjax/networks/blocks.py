@@ -39,10 +39,83 @@ def bilinear_upsample(image: Image, factor: int = 2) -> Image:
     return jax.image.resize(image, (*lead, height * factor, width * factor, channels), "linear")
 
 
-def conv(features: int, size: int = 3, **options) -> nn.Conv:
-    """A stride-1 convolution, ``size`` x ``size``, zero padding, whose gradient is fast inside a scan."""
+def bilinear_upsample_corners(image: Image) -> Image:
+    """Twice the size, corners on corners: output i reads i (n - 1) / (2 n - 1) (PyTorch's ``align_corners=True``)."""
+    for axis in (-3, -2):
+        size = image.shape[axis]
+        index = jnp.arange(size, dtype=image.dtype).reshape(-1, *(1,) * (-1 - axis))
+        before, after = index / (2 * size - 1), (size - 1 - index) / (2 * size - 1)
+        # Outputs 2k and 2k + 1 lie a little before and after input k: no gather, whose gradient would be a scatter.
+        inner = [jax.lax.slice_in_dim(image, k, size - 1 + k, axis=axis % image.ndim) for k in (0, 1)]
+        first, last = (jax.lax.slice_in_dim(image, k, k + 1, axis=axis % image.ndim) for k in (0, size - 1))
+        previous, following = (jnp.concatenate(parts, axis) for parts in ([first, inner[0]], [inner[1], last]))
+        pair = [image + before * (previous - image), image + after * (following - image)]
+        shape = list(image.shape)
+        shape[axis] *= 2
+        image = jnp.stack(pair, axis=axis % image.ndim + 1).reshape(shape)
+    return image
+
+
+def conv(features: int, size: int = 3, stride: int = 1, **options) -> nn.Conv:
+    """A convolution, ``size`` x ``size``, zero padding, whose gradient is fast inside a scan.
+
+    With a stride, ``(size - 1) // 2`` zeros on every side, as PyTorch networks do; give ``padding`` for other ones. The
+    fast gradient then needs sizes that are multiples of the stride.
+    """
+    if stride > 1:
+        options = {"padding": (size - 1) // 2, **options}
     options = {"kernel_init": kernel_bound, **options}
-    return nn.Conv(features, (size, size), conv_general_dilated=scan_friendly_convolution, **options)
+    return nn.Conv(features, (size, size), (stride, stride), conv_general_dilated=scan_friendly_convolution, **options)
+
+
+def batch_norm(train: bool) -> nn.BatchNorm:
+    """BatchNorm with PyTorch's defaults: eps 1e-5, running statistics that move by 0.1 towards each batch's."""
+    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)
+
+
+class ConvNorm(nn.Module):
+    """Convolution, BatchNorm, ReLU; its parts are ``Conv_0`` and ``BatchNorm_0``.
+
+    Attributes:
+      width: output channels.
+      size: of the kernel.
+      stride: see ``conv``.
+    """
+
+    width: int
+    size: int = 3
+    stride: int = 1
+
+    @nn.compact
+    def __call__(self, x: Image, train: bool = False) -> Image:
+        """Return ``[B, H / stride, W / stride, width]``."""
+        return nn.relu(batch_norm(train)(conv(self.width, self.size, self.stride)(x)))
+
+
+class GatedConv(nn.Module):
+    """Lightweight gated convolution: sigma(M) * F with a mask M of one channel (ExtraNet section 4.3, eq 1-3).
+
+    M is the last output channel of ``Conv_0``: one convolution reads the input once. ``BatchNorm_0`` and a ReLU follow
+    if ``norm``.
+
+    Attributes:
+      width: output channels.
+      size: of the kernel.
+      stride: see ``conv``.
+      norm: BatchNorm and ReLU behind the gate.
+    """
+
+    width: int
+    size: int = 3
+    stride: int = 1
+    norm: bool = True
+
+    @nn.compact
+    def __call__(self, x: Image, train: bool = False) -> Image:
+        """Return ``[B, H / stride, W / stride, width]``."""
+        both = conv(self.width + 1, self.size, self.stride)(x)
+        x = nn.sigmoid(both[..., -1:]) * both[..., :-1]
+        return nn.relu(batch_norm(train)(x)) if self.norm else x
 
 
 def replicated_conv(x: Image, features: int, size: int = 3, **options) -> Image:
@@ -73,6 +146,6 @@ class ConvBlock(nn.Module):
         return x
 
 
-def zero_conv(channels: int) -> nn.Conv:
-    """A 3x3 convolution that returns zero until it is trained: residuals and flows start at their prior."""
-    return conv(channels, kernel_init=nn.initializers.zeros)
+def zero_conv(channels: int, size: int = 3) -> nn.Conv:
+    """A convolution that returns zero until it is trained: residuals and flows start at their prior."""
+    return conv(channels, size, kernel_init=nn.initializers.zeros)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from essjax.losses import charbonnier, feature_l1, l1, masked_mean, occlusion, sum_of_means, temporal_l1
+from essjax.losses import charbonnier, feature_l1, hardest, l1, masked_mean, occlusion, sum_of_means, temporal_l1
 from tests.helpers import random_image
 
 pytestmark = pytest.mark.usefixtures("strict_numerics")
@@ -72,6 +72,28 @@ def test_occlusion_by_hand():
     # Eq 11: ||m a - m b||_1 / sum(m) = 6, here per channel.
     assert float(masked_mean(per_pixel, hole)) == pytest.approx(2.0)
     assert float(masked_mean(occlusion(prediction, target, 0.0 * hole), 0.0 * hole)) == 0.0
+
+
+@given(seed=SEEDS)
+def test_hardest_pixels_match_a_sort(seed):
+    """Eq 6 per image: the mean over the 35 pixels' worst tenth (4 of them), channels averaged first."""
+    errors = random_image(seed, *SHAPE)
+    weights = jax.jit(hardest)(errors)
+    worst = np.sort(np.asarray(errors, np.float64).mean(axis=-1).reshape(2, -1), axis=-1)[:, -4:]
+    assert weights.shape == (2, 5, 7, 1) and set(np.unique(weights)) == {0.0, 1.0}
+    np.testing.assert_array_equal(weights.sum(axis=(1, 2, 3)), 4.0)
+    assert float(masked_mean(errors, weights)) == pytest.approx(worst.mean(), rel=1e-5)
+    assert float(jnp.mean(errors * weights)) == pytest.approx(worst.sum() / 70, rel=1e-5)
+
+
+def test_hardest_pixels_share_ties_and_have_no_gradient():
+    errors = jnp.array([[[2.0], [1.0], [1.0], [0.0], [1.0], [0.0]]])  # one row of six pixels
+    np.testing.assert_allclose(hardest(errors, share=0.5)[0, :, 0], [1, 2 / 3, 2 / 3, 0, 2 / 3, 0], rtol=1e-6)
+    np.testing.assert_array_equal(hardest(errors, share=1e-6)[0, :, 0], [1, 0, 0, 0, 0, 0])  # at least one
+    gradient = jax.grad(lambda x: masked_mean(x, hardest(x, share=0.5)))(errors)
+    np.testing.assert_allclose(gradient[0, :, 0], np.array([1, 2 / 3, 2 / 3, 0, 2 / 3, 0]) / 3, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"share: expected a number in \(0, 1\], got 0"):
+        hardest(errors, share=0)
 
 
 def test_temporal_l1_looks_at_valid_pixels_only():
