@@ -13,7 +13,7 @@ from essjax.interfaces import Network
 from essjax.networks.blocks import conv, crop, pad_to_multiple, replicated_conv
 from essjax.networks.linen import from_linen, kernel_bound
 from essjax.typing import Array, Image, Key
-from essjax.warp import depth_to_space, space_to_depth
+from essjax.warp import depth_to_space
 
 BLOCK = 4
 """Output pixels per network pixel, in each dimension."""
@@ -35,9 +35,7 @@ class DLCTUSNet(nn.Module):
     def __call__(self, inputs: Image, train: bool = False) -> Image:
         """Return ``[B, H, W, 2]``, not clamped, from ``[B, H, W, C]``, both at output resolution."""
         height, width = inputs.shape[-3:-1]
-        # Folding blocks into channels makes the 4x4 convolution with stride 4 a product per pixel (section 4.4.4).
-        x = space_to_depth(pad_to_multiple(inputs, BLOCK), BLOCK)
-        x = conv(WIDTH, 1, kernel_init=_small_bound)(x)
+        x = conv(WIDTH, BLOCK, BLOCK, padding="VALID", kernel_init=_small_bound)(pad_to_multiple(inputs, BLOCK))
         for block in range(RESIDUAL_BLOCKS):
             residual = nn.relu(replicated_conv(x, WIDTH, kernel_init=_small_bound))
             # The untrained outputs lie in the middle of the clamp, where they have a gradient.
