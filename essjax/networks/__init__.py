@@ -3,5 +3,6 @@
 from essjax.networks.dlctus import dlctus_network
 from essjax.networks.extrassnet import extrassnet
 from essjax.networks.frnet import frnet
+from essjax.networks.nsrr import nsrr
 
-__all__ = ["dlctus_network", "extrassnet", "frnet"]
+__all__ = ["dlctus_network", "extrassnet", "frnet", "nsrr"]

@@ -15,6 +15,7 @@ from essjax.warp.upsample import (
     depth_to_space,
     jitter_aligned_upsample,
     sample_distance,
+    sample_zero_upsampled,
     space_to_depth,
     zero_upsample,
 )
@@ -22,6 +23,6 @@ from essjax.warp.upsample import (
 __all__ = [
     "backward_warp", "candidate_offsets", "compose_motion", "depth_to_space", "dilate_motion", "gbuffer_guided_warp",
     "guided_weights", "guides", "hole_mask", "inside_mask", "jitter_aligned_upsample", "jittered_motion",
-    "occlusion_motion", "sample", "sample_by_fetches", "sample_distance", "space_to_depth", "splat", "splat_nearest",
-    "upsample_motion", "zero_upsample",
+    "occlusion_motion", "sample", "sample_by_fetches", "sample_distance", "sample_zero_upsampled", "space_to_depth",
+    "splat", "splat_nearest", "upsample_motion", "zero_upsample",
 ]  # fmt: skip
