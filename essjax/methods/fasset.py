@@ -4,6 +4,7 @@ Sections 3.2, 3.3. Both tasks get the same kind of input: a frame with holes, cu
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,46 +19,97 @@ from essjax.frames import (
     network_depth,
     rendered_color,
     require,
+    select_time,
     surface_guides,
 )
-from essjax.interfaces import Method, MethodInfo, expand_flag, reset_at_cut
-from essjax.methods.rendered import GUIDED
-from essjax.typing import Array, Color, Image, Jitter, Mask, Motion, Scalar, pytree
-from essjax.warp import backward_warp, compose_motion, fill_holes, hole_mask, jitter_aligned_upsample, jittered_motion
+from essjax.interfaces import Method, MethodInfo, reset_at_cut
+from essjax.methods.rendered import GUIDED, Memory, advance, push, reset_memory, start_memory
+from essjax.typing import Color, Image, Mask, Scalar, pytree
+from essjax.warp import backward_warp, fill_holes, hole_mask, jitter_aligned_upsample, jittered_motion
 
 
 @pytree
-class History:
-    """What FASSET remembers: the last rendered frame, the path back to it, and the last frame of either kind.
+class Kept:
+    """What is kept of a rendered frame.
 
     Attributes:
-      color: of the last rendered frame, log1p, ``[..., H, W, 3]``.
-      hidden: the recurrent state after it, ``[..., H, W, width]``, at its samples.
-      rendered: its G-buffers.
-      rendered_jitter: its jitter.
-      motion: composed motion from the last frame's samples to it, unjittered.
-      valid: ``[..., H, W, 1]``: 1 where that path stays on screen.
-      gbuffers: of the last frame.
-      jitter: of the last frame.
-      depth_scale: unit of depth, ``[...]``.
-      empty: bool ``[...]``: nothing rendered since the cut.
+      color: log1p, ``[..., H, W, 3]``.
+      hidden: the recurrent state after it, ``[..., H, W, width]``.
+      surfaces: the G-buffers that tell surfaces apart.
     """
 
     color: Color
     hidden: Image
-    rendered: GBuffers
-    rendered_jitter: Jitter
-    motion: Motion
-    valid: Mask
-    gbuffers: GBuffers
-    jitter: Jitter
+    surfaces: GBuffers
+
+
+@pytree
+class History:
+    """The last rendered frame and the last frame of either kind.
+
+    Attributes:
+      rendered: memory of one frame, its content a ``Kept``.
+      surfaces: G-buffers of the last frame.
+      depth_scale: unit of depth, ``[...]``.
+    """
+
+    rendered: Memory
+    surfaces: GBuffers
     depth_scale: Scalar
-    empty: Array
+
+
+class Arrival(NamedTuple):
+    """What the history shows at a frame's samples.
+
+    Attributes:
+      color: of the last rendered frame, 0 in holes.
+      hidden: its recurrent state, 0 in holes.
+      valid: 1 where the last rendered frame showed this surface, 0 in holes, ``[..., H, W, 1]``.
+      recent: 1 where the last frame, rendered or not, did; 1 everywhere if there was none.
+    """
+
+    color: Color
+    hidden: Image
+    valid: Mask
+    recent: Mask
 
 
 def _surfaces(gbuffers: GBuffers) -> GBuffers:
-    """The buffers that tell surfaces apart; a history need not carry the others."""
-    return dataclasses.replace(gbuffers, base_color=None, roughness=None, metallic=None, specular=None, n_dot_v=None)
+    kept = dataclasses.replace(gbuffers, base_color=None, roughness=None, metallic=None, specular=None, n_dot_v=None)
+    return jax.tree.map(jnp.copy, kept)  # streaming donates the history, not the frame
+
+
+def _start(example: Frame, width: int) -> History:
+    size = example.motion.shape[:-1]
+    kept = Kept(color=jnp.zeros((*size, 3)), hidden=jnp.zeros((*size, width)), surfaces=_surfaces(example.gbuffers))
+    return History(
+        rendered=start_memory(example, kept, 1),
+        surfaces=_surfaces(example.gbuffers),
+        depth_scale=depth_scale(example.gbuffers),
+    )
+
+
+def _arrive(history: History, frame: Frame, width: int) -> tuple[History, Arrival]:
+    """The history with its path extended to ``frame``, and what it shows there."""
+    fresh, before = _start(frame, width), history.rendered
+    before = reset_memory(frame.cut, fresh.rendered, before)
+    surfaces = reset_at_cut(frame.cut, fresh.surfaces, history.surfaces)
+    unit = reset_at_cut(frame.cut, fresh.depth_scale, history.depth_scale)
+    empty = before.count[..., None, None, None] == 0
+    recent = hole_mask(frame.gbuffers, surfaces, frame.motion, jitter=frame.jitter, jitter_previous=before.jitter)
+    memory = advance(before, frame)
+    last = select_time(memory.frames, 0)
+    same = hole_mask(
+        frame.gbuffers, last.content.surfaces, last.motion, jitter=frame.jitter, jitter_previous=last.jitter
+    )
+    valid = jnp.where(empty, 0.0, same * last.valid)
+    if frame.reactive is not None:
+        valid = valid * (1.0 - frame.reactive)
+    lookup = jax.lax.stop_gradient(jittered_motion(last.motion, frame.jitter, last.jitter))
+    both = jnp.concatenate([jax.lax.stop_gradient(last.content.color), last.content.hidden], axis=-1)
+    warped = valid * backward_warp(both, lookup)
+    history = History(rendered=memory, surfaces=_surfaces(frame.gbuffers), depth_scale=unit)
+    return history, Arrival(warped[..., :3], warped[..., 3:], valid, jnp.where(empty, 1.0, recent))
 
 
 def fasset(
@@ -94,91 +146,44 @@ def fasset(
     removed = {"no-gencoder": not gencoder, "no-mask": not mask_rendered, "no-sharing": not shared}
     name = "-".join(["fasset", *(part for part, absent in removed.items() if absent)])
 
+    def start(example):
+        return _start(example, width)
+
     def init(key, example):
         require(example, sorted(GUIDED), name)
-        history, color = start(example), jnp.zeros((*example.motion.shape[:-1], 3))
-        inputs = color, history.valid, _guides(history, example), history.hidden, example.jitter
-        return {"fasset": network.init(key, *inputs)}
+        history, size = start(example), example.motion.shape[:-1]
+        inputs = jnp.zeros((*size, 3)), jnp.zeros((*size, 1)), _guides(history, example), jnp.zeros((*size, width))
+        return {"fasset": network.init(key, *inputs, example.jitter)}
 
-    def start(example: Frame) -> History:
-        size = example.motion.shape[:-1]
-        copied = lambda: jax.tree.map(jnp.copy, (_surfaces(example.gbuffers), example.jitter))  # noqa: E731
-        # No array twice: streaming donates the history.
-        (rendered, rendered_jitter), (gbuffers, jitter) = copied(), copied()
-        return History(
-            color=jnp.zeros((*size, 3), jnp.float32),
-            hidden=jnp.zeros((*size, width), jnp.float32),
-            rendered=rendered,
-            rendered_jitter=rendered_jitter,
-            motion=jnp.zeros_like(example.motion),
-            valid=jnp.ones((*size, 1), jnp.float32),
-            gbuffers=gbuffers,
-            jitter=jitter,
-            depth_scale=depth_scale(example.gbuffers),
-            empty=jnp.ones(example.cut.shape, bool),
-        )
-
-    def arrive(history: History, frame: Frame) -> tuple[History, Image, Mask, Mask]:
-        """The history with its path extended to ``frame``; colour and hidden state warped along it; two masks.
-
-        Their 1 means: the last rendered frame showed this surface (what is warped is valid); the last frame did.
-        """
-        history = reset_at_cut(frame.cut, start(frame), history)
-        jitters = {"jitter": frame.jitter, "jitter_previous": history.jitter}
-        motion, inside = compose_motion(frame.motion, history.motion, **jitters, valid_previous=history.valid)
-        same = hole_mask(
-            frame.gbuffers, history.rendered, motion, jitter=frame.jitter, jitter_previous=history.rendered_jitter
-        )
-        valid = jnp.where(expand_flag(history.empty, same.ndim), 0.0, same * inside)
-        if frame.reactive is not None:
-            valid = valid * (1.0 - frame.reactive)
-        recent = hole_mask(frame.gbuffers, history.gbuffers, frame.motion, **jitters)
-        lookup = jax.lax.stop_gradient(jittered_motion(motion, frame.jitter, history.rendered_jitter))
-        both = jnp.concatenate([jax.lax.stop_gradient(history.color), history.hidden], axis=-1)
-        history = dataclasses.replace(
-            history, motion=motion, valid=inside, gbuffers=_surfaces(frame.gbuffers), jitter=frame.jitter
-        )
-        return history, valid * backward_warp(both, lookup), valid, recent
-
-    def _guides(history: History, frame: Frame) -> Image:
-        base_color, normal = surface_guides(frame.gbuffers)
-        return jnp.concatenate([base_color, network_depth(frame.gbuffers, history.depth_scale), normal], axis=-1)
-
-    def predict(variables, history, frame, color, mask, state, *, train: bool, task: str):
-        """The output and the new hidden state from a frame with holes (0 there)."""
-        inputs = color, mask, _guides(history, frame), state, frame.jitter
-        (residual, state), _ = network.apply(variables["fasset"], *inputs, train=train, method=task)
+    def predict(variables, history, frame, color, mask, hidden, train, task):
+        """The output as log1p and the new hidden state, from a frame whose holes are 0."""
+        inputs = color, mask, _guides(history, frame), hidden, frame.jitter
+        (residual, hidden), _ = network.apply(variables["fasset"], *inputs, train=train, method=task)
         base = jitter_aligned_upsample(fill_holes(color, mask), scale, frame.jitter)
-        return jax.lax.stop_gradient(base) + residual, state
+        return jax.lax.stop_gradient(base) + residual, hidden
 
     def render_step(variables, history, frame, *, train=False):
         color = log1p(rendered_color(frame, name))
-        history, warped, _, recent = arrive(history, frame)
-        recent = jnp.where(expand_flag(history.empty, recent.ndim), 1.0, recent)  # nothing was warped: no holes
-        mask = recent if mask_rendered else jnp.ones_like(recent)
-        log_image, state = predict(
-            variables, history, frame, jnp.where(mask > 0, color, 0.0), mask, warped[..., 3:], train=train, task="render"
-        )
-        history = dataclasses.replace(
-            history,
-            color=color,
-            hidden=state,
-            rendered=jax.tree.map(jnp.copy, history.gbuffers),
-            rendered_jitter=jnp.copy(frame.jitter),
-            motion=jnp.zeros_like(history.motion),
-            valid=jnp.ones_like(history.valid),
-            empty=jnp.zeros_like(history.empty),
-        )
-        return history, Prediction(
-            image=expm1(log_image), aux={"log_image": log_image, "mask": mask, "valid": recent}
-        )
+        history, arrival = _arrive(history, frame, width)
+        mask = arrival.recent if mask_rendered else jnp.ones_like(arrival.recent)
+        visible = jnp.where(mask > 0, color, 0.0)
+        log_image, hidden = predict(variables, history, frame, visible, mask, arrival.hidden, train, "render")
+        kept = Kept(color=color, hidden=hidden, surfaces=_surfaces(frame.gbuffers))
+        history = dataclasses.replace(history, rendered=push(history.rendered, frame, kept))
+        aux = {"log_image": log_image, "mask": mask, "valid": arrival.recent}
+        return history, Prediction(image=expm1(log_image), aux=aux)
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history, warped, mask, _ = arrive(history, frame)
-        log_image, _ = predict(
-            variables, history, frame, warped[..., :3], mask, warped[..., 3:], train=train, task="extrapolate"
-        )
+        history, arrival = _arrive(history, frame, width)
+        color, hidden, mask, _ = arrival
+        log_image, _ = predict(variables, history, frame, color, mask, hidden, train, "extrapolate")
         return history, Prediction(image=expm1(log_image), aux={"log_image": log_image, "mask": mask, "valid": mask})
 
     info = MethodInfo(name, scale=scale, requires=GUIDED)
     return Method(init, start, render_step, extrapolate_step, info)
+
+
+def _guides(history: History, frame: Frame) -> Image:
+    """Albedo, depth and normal as the network sees them, ``[..., H, W, 7]``."""
+    base_color, normal = surface_guides(frame.gbuffers)
+    return jnp.concatenate([base_color, network_depth(frame.gbuffers, history.depth_scale), normal], axis=-1)

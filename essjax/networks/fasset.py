@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from essjax.interfaces import Network
-from essjax.networks.blocks import GatedConv, conv, crop, mean_pool, pad_to_multiple
+from essjax.networks.blocks import Chain, GatedConv, conv, crop, mean_pool, pad_to_multiple
 from essjax.networks.extrassnet import Decoder
 from essjax.networks.linen import from_linen, kernel_bound
 from essjax.typing import Array, Image, Jitter, Mask
@@ -74,10 +74,7 @@ class GEncoder(nn.Module):
     @nn.compact
     def __call__(self, gbuffers: Image) -> Image:
         """Encode ``[B, H, W, 7]`` to ``[B, H, W, width]``."""
-        x = gbuffers
-        for _ in range(2):
-            x = nn.relu(conv(self.width)(x))
-        return conv(self.width)(x)
+        return conv(self.width)(Chain((self.width, self.width))(gbuffers))
 
 
 class Reweighting(nn.Module):
@@ -94,9 +91,7 @@ class Reweighting(nn.Module):
     @nn.compact
     def __call__(self, frame: Image, gbuffers: Image) -> tuple[Mask, Mask]:
         """Weights ``[B, H, W, 1]`` for M and M_G."""
-        x = jnp.concatenate([frame, gbuffers], axis=-1)
-        for _ in range(2):
-            x = nn.relu(conv(self.width)(x))
+        x = Chain((self.width, self.width))(jnp.concatenate([frame, gbuffers], axis=-1))
         last = conv(2, kernel_init=nn.initializers.zeros, bias_init=nn.initializers.constant(_UNIT_WEIGHT))
         weights = MAX_WEIGHT / 2 * (1.0 + nn.tanh(last(x)))
         return weights[..., :1], weights[..., 1:]
@@ -156,8 +151,7 @@ class FASSET(nn.Module):
         height, width = mask.shape[-3:-1]
         inputs = jnp.concatenate([frame, mask, gbuffers[..., 3:]], axis=-1)
         features, hidden = (
-            crop(x, height, width)
-            for x in encoder(*(pad_to_multiple(x, 2 ** (LEVELS - 1)) for x in (inputs, hidden)))
+            crop(x, height, width) for x in encoder(*(pad_to_multiple(x, 2 ** (LEVELS - 1)) for x in (inputs, hidden)))
         )
         surface = self.gbuffer_encoder(gbuffers) if self.gencoder else gbuffers
         weight, weight_surface = self.reweighting(frame, gbuffers)

@@ -1,4 +1,4 @@
-"""FASSET's networks: the paper's sizes, RenderINR against NumPy, weights of features, odd sizes."""
+"""FASSET's networks: the paper's sizes, RenderINR against NumPy, weights of features, where latents are read."""
 
 import functools
 import math
@@ -68,7 +68,7 @@ def test_feature_weights_start_at_one_and_stay_between_zero_and_ten():
         np.testing.assert_allclose(weight, 1.0, rtol=1e-5)
     first, second = apply(noisy(variables, 1, 0.1), image[..., :3], image[..., 3:])
     for weight in (first, second):
-        assert weight.shape == (2, 5, 7, 1) and 0 < float(weight.min()) and float(weight.max()) < 10
+        assert weight.shape == (2, 5, 7, 1) and float(weight.min()) > 0 and float(weight.max()) < 10
         assert float(weight.max() - weight.min()) > 0.1
     assert float(jnp.abs(first - second).max()) > 0.1
 
@@ -96,3 +96,36 @@ def test_every_input_and_every_task_has_its_say(tiny):
     for k in range(len(given)):
         changed = [x[::-1] if n == k else x for n, x in enumerate(given)]
         assert float(jnp.abs(run["render"](variables, *changed)[0] - outputs["render"]).max()) > 1e-4
+
+
+# scale, jitter, first output pixel and step of those whose centres, less the jitter, are centres of LR pixels, and which
+ALIGNED = [
+    (1.5, -0.5, 1, 3, 1, 2),  # (3k + 1.5) / 1.5 + 0.5 = 2k + 1.5: pixel 2k + 1
+    (2, -0.25, 0, 2, 0, 1),  # (2k + 0.5) / 2 + 0.25 = k + 0.5
+    (3.3, 0.5 / 3.3 - 0.5, 0, 33, 0, 10),  # (33k + 0.5) / 3.3 + 0.5 - 0.5 / 3.3 = 10k + 0.5
+]
+
+
+@functools.cache
+def outputs_at(scale):
+    network = fasset(scale, width=3, hidden=5)
+    return jax.jit(lambda variables, *x: network.apply(variables, *x, method="render")[0][0])
+
+
+@pytest.mark.parametrize(("scale", "jitter", "first", "step", "low_first", "low_step"), ALIGNED)
+def test_latents_are_read_where_the_samples_lie(tiny, scale, jitter, first, step, low_first, low_step):
+    """With any weights: output pixels that fall on samples are those of scale 1, where every pixel does."""
+    variables = noisy(tiny[1], 3)
+    del variables["params"]["frame_encoder_ess"]
+    pixel_size = variables["params"]["inr"]["pixel_size"]["kernel"]
+    *given, _ = inputs(2, 13, 18, 3)
+
+    def run(scale, jitter, kernel):
+        variables["params"]["inr"]["pixel_size"]["kernel"] = kernel
+        return np.asarray(outputs_at(scale)(variables, *given, jnp.full((2, 2), jitter)))
+
+    low = run(1, 0.0, pixel_size / scale)[:, low_first::low_step, low_first::low_step]
+    high = run(scale, jitter, pixel_size)[:, first::step, first::step]
+    rows, columns = (min(high.shape[axis], low.shape[axis]) for axis in (1, 2))
+    assert rows > 1 and columns > 1 and np.std(low) > 0.05
+    np.testing.assert_allclose(high[:, :rows, :columns], low[:, :rows, :columns], rtol=1e-3, atol=1e-3)
