@@ -23,7 +23,7 @@ from essjax.warp.upsample import (
 
 __all__ = [
     "backward_warp", "candidate_offsets", "compose_motion", "depth_to_space", "dilate_motion", "fill_holes",
-    "gbuffer_guided_warp", "guided_weights", "guides", "hole_mask", "inside_mask", "jitter_aligned_upsample", "jittered_motion",
-    "occlusion_motion", "sample", "sample_by_fetches", "sample_distance", "sample_zero_upsampled", "space_to_depth",
-    "splat", "splat_nearest", "upsample_motion", "zero_upsample",
+    "gbuffer_guided_warp", "guided_weights", "guides", "hole_mask", "inside_mask", "jitter_aligned_upsample",
+    "jittered_motion", "occlusion_motion", "sample", "sample_by_fetches", "sample_distance", "sample_zero_upsampled",
+    "space_to_depth", "splat", "splat_nearest", "upsample_motion", "zero_upsample",
 ]  # fmt: skip
