@@ -77,7 +77,7 @@ def _check_request(out: Path, clips: Sequence[Clip], settings: dict) -> dict[str
         return {}
     dataset = read_dataset(out)
     for key, asked in settings.items():
-        found = dataset.source.get(key)
+        found = dataset.source.get(key, False if key == "ranges" else None)
         if found != asked:
             raise ValueError(
                 f"{out}: this dataset was made with {key} = {found!r}, asked for {asked!r}. "
@@ -103,6 +103,7 @@ def generate(
     *,
     scale: int = 2,
     native: bool = False,
+    ranges: bool = False,
     mip_bias: float = 0.0,
     progress: Progress = lambda done, total: None,
 ) -> Dataset:
@@ -118,6 +119,7 @@ def generate(
       height: LR height, pixels.
       scale: reference size over frame size.
       native: also frames at the reference's size (the input of native TAA).
+      ranges: also the ranges over the reference's samples (what a classifier's labels are made of).
       mip_bias: texture filter, see ``scenes.render_frame``.
       progress: called after each frame.
 
@@ -127,19 +129,19 @@ def generate(
     out, clips = Path(out), list(clips)
     shared = {"renderer": "essjax.scenes", "width": width, "height": height, "scale": scale, "native": native}
     shared["mip_bias"] = float(mip_bias)
-    splits: dict[str, list] = _check_request(out, clips, shared)
+    if ranges:  # not written where false: datasets older than ranges can still grow
+        shared["ranges"] = True
+    splits: dict[str, list] = _check_request(out, clips, {**shared, "ranges": ranges})
+    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias}
     done, total = 0, sum(clip.frames for clip in clips)
     for clip in clips:
         scene = make_scene(clip.family, clip.seed, clip.frames)
         writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
         for index in range(clip.frames):
             if index not in writer:
-                frame = render_frame(
-                    scene, index, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias
-                )
-                writer.write(
-                    index, frame.frames, frame.reference, valid=frame.valid, steady=frame.steady, native=frame.native
-                )
+                frame = render_frame(scene, index, width, height, spp=clip.spp, **settings)
+                extra = {name: getattr(frame, name) for name in ("valid", "steady", "native", "ranges")}
+                writer.write(index, frame.frames, frame.reference, **extra)
             done += 1
             progress(done, total)
         writer.finish()
@@ -155,6 +157,7 @@ def live_source(
     *,
     scale: int = 2,
     native: bool = False,
+    ranges: bool = False,
     mip_bias: float = 0.0,
     on_frame: Callable[[int], Any] | None = None,
 ) -> CachedSource:
@@ -166,14 +169,14 @@ def live_source(
       height: LR height, pixels.
       scale: see ``generate``.
       native: see ``generate``.
+      ranges: see ``generate``.
       mip_bias: see ``generate``.
       on_frame: called with the index of each finished frame of a clip.
     """
 
     def render(clip: Clip) -> essjax.frames.Sequence:
         scene = make_scene(clip.family, clip.seed, clip.frames)
-        return render_sequence(
-            scene, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias, on_frame=on_frame
-        )
+        settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias}
+        return render_sequence(scene, width, height, spp=clip.spp, on_frame=on_frame, **settings)
 
     return CachedSource(functools.partial(render, clip) for clip in clips)
