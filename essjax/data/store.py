@@ -257,7 +257,7 @@ class SequenceWriter:
         if extra.native is not None:
             validate_frame(extra.native, f"{where}, native", ("color",))
         if extra.ranges is not None:
-            validate_ranges(extra.ranges, *reference.shape[:2], f"{where}, ranges")
+            validate_ranges(extra.ranges, reference.shape[0], reference.shape[1], f"{where}, ranges")
         if not (np.isfinite(reference).all() and reference.min() >= 0):
             raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
 

@@ -73,23 +73,23 @@ def render_frame(
     world = scene.at(index)
     wide, high = width * scale, height * scale
     angle = pixel_angle(world, wide, mip_bias)
-    native_frame, sample_ranges = None, None
+    native_frame = None
+
+    def from_samples() -> tuple[np.ndarray, SampleRanges | None]:
+        if not ranges:
+            return render_reference(world, wide, high, spp=spp), None
+        images = render_statistics(world, scene.before(index), wide, high, spp=spp)
+        return images["reference"], _ranges(images)
+
     # Beside the buffers, so that the two compilations of the first frame run at the same time.
     with ThreadPoolExecutor(1) as beside:
-        if ranges:  # the same samples make both
-            reference = beside.submit(render_statistics, world, scene.before(index), wide, high, spp=spp)
-        else:
-            reference = beside.submit(render_reference, world, wide, high, spp=spp)
+        sampled = beside.submit(from_samples)
         frame, valid, steady = _frame(scene, index, width, height, jitter_sequence(index + 1)[index], angle)
         if native:
             jitter = jitter_sequence(index + 1, every_frame=True)[index]
             native_frame, _, _ = _frame(scene, index, wide, high, jitter, angle)
-    image = reference.result()
-    if ranges:
-        sample_ranges, image = _ranges(image), image["reference"]
-    return Sequence(
-        frames=frame, reference=image, valid=valid, steady=steady, native=native_frame, ranges=sample_ranges
-    )
+    reference, found = sampled.result()
+    return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame, ranges=found)
 
 
 def _ranges(images: dict[str, np.ndarray]) -> SampleRanges:
