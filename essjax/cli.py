@@ -83,6 +83,7 @@ def scenes(
     ranges: bool = False,
     seed: int = 0,
     mip_bias: float = 0.0,
+    jitter: Literal["halton", "dlctus"] = "halton",
 ) -> None:
     """Render built-in scenes into a dataset. Interrupted, the same command resumes; other splits can be added.
 
@@ -99,11 +100,12 @@ def scenes(
       ranges: Also the ranges over the reference's samples, which a classifier is trained on.
       seed: Skip this many seeds of the split.
       mip_bias: Texture filter, log2 of its width over an output pixel's.
+      jitter: Pattern of the sample positions: halton serves half the frames as well as all, dlctus only all of them.
     """
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None
     clips = plan(split, sequences, frames, spp=spp, families=chosen, start=seed)
-    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias}
+    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
     with progress_bar("rendering") as progress:
         dataset = generate(out, clips, width, height, progress=progress, **settings)
     _print_dataset(dataset)

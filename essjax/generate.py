@@ -10,6 +10,8 @@ import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
 from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
 
+UNSAID = {"jitter": "halton", "ranges": False}
+"""Settings that a dataset names only if they differ from these: it may be older than the choice."""
 Progress = Callable[[int, int], Any]
 """Called with (frames done, frames in all)."""
 
@@ -76,8 +78,8 @@ def _check_request(out: Path, clips: Sequence[Clip], settings: dict) -> dict[str
     if not (out / "dataset.json").is_file():
         return {}
     dataset = read_dataset(out)
-    for key, asked in settings.items():
-        found = dataset.source.get(key, False if key == "ranges" else None)
+    for key, asked in {**UNSAID, **settings}.items():
+        found = dataset.source.get(key, UNSAID.get(key))
         if found != asked:
             raise ValueError(
                 f"{out}: this dataset was made with {key} = {found!r}, asked for {asked!r}. "
@@ -105,6 +107,7 @@ def generate(
     native: bool = False,
     ranges: bool = False,
     mip_bias: float = 0.0,
+    jitter: str = "halton",
     progress: Progress = lambda done, total: None,
 ) -> Dataset:
     """Render clips into a dataset, frame by frame and atomically; running it again resumes.
@@ -121,6 +124,7 @@ def generate(
       native: also frames at the reference's size (the input of native TAA).
       ranges: also the ranges over the reference's samples (what a classifier's labels are made of).
       mip_bias: texture filter, see ``scenes.render_frame``.
+      jitter: pattern, "halton" or "dlctus", see ``scenes.jitter_sequence``.
       progress: called after each frame.
 
     Raises:
@@ -129,10 +133,9 @@ def generate(
     out, clips = Path(out), list(clips)
     shared = {"renderer": "essjax.scenes", "width": width, "height": height, "scale": scale, "native": native}
     shared["mip_bias"] = float(mip_bias)
-    if ranges:  # not written where false: datasets older than ranges can still grow
-        shared["ranges"] = True
-    splits: dict[str, list] = _check_request(out, clips, {**shared, "ranges": ranges})
-    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias}
+    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+    shared |= {key: settings[key] for key, usual in UNSAID.items() if settings[key] != usual}
+    splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
     for clip in clips:
         scene = make_scene(clip.family, clip.seed, clip.frames)
@@ -159,6 +162,7 @@ def live_source(
     native: bool = False,
     ranges: bool = False,
     mip_bias: float = 0.0,
+    jitter: str = "halton",
     on_frame: Callable[[int], Any] | None = None,
 ) -> CachedSource:
     """A source for ``data.clips`` that renders each clip when first asked for it, without touching the disk.
@@ -171,12 +175,13 @@ def live_source(
       native: see ``generate``.
       ranges: see ``generate``.
       mip_bias: see ``generate``.
+      jitter: see ``generate``.
       on_frame: called with the index of each finished frame of a clip.
     """
 
     def render(clip: Clip) -> essjax.frames.Sequence:
         scene = make_scene(clip.family, clip.seed, clip.frames)
-        settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias}
+        settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
         return render_sequence(scene, width, height, spp=clip.spp, on_frame=on_frame, **settings)
 
     return CachedSource(functools.partial(render, clip) for clip in clips)

@@ -1,5 +1,6 @@
-"""Means over part of an image, and the loss that looks at disoccluded pixels only."""
+"""Means over part of an image, and the losses that look at disoccluded or at the worst pixels only."""
 
+import jax
 import jax.numpy as jnp
 
 from essjax.losses.pixel import l1
@@ -24,9 +25,9 @@ def masked_mean(values: Image, mask: Mask, *, axis: int | tuple[int, ...] | None
 
 
 def occlusion(prediction: Color, target: Color, hole: Mask) -> Color:
-    """``hole * |prediction - target|``, ``[..., H, W, 3]``: the numerator of ExtraSS eq 11.
+    """``hole * |prediction - target|``, ``[..., H, W, 3]``: the numerator of ExtraSS eq 11, ExtraNet eq 5, FASSET eq 3.
 
-    ``masked_mean(occlusion(...), hole)`` divides by the hole's size as eq 11 does (and by the number of channels, so
+    ``masked_mean(occlusion(...), hole)`` divides by the hole's size as those do (and by the number of channels, so
     that it is on the scale of the mean L1 next to it), and is 0 where nothing was disoccluded.
 
     Args:
@@ -38,3 +39,33 @@ def occlusion(prediction: Color, target: Color, hole: Mask) -> Color:
       ValueError: the images' shapes differ.
     """
     return hole * l1(prediction, target)
+
+
+def hardest(errors: Image, *, share: float = 0.1) -> Mask:
+    """Which pixels of each image have the largest errors: the set of ExtraNet eq 6 and FASSET eq 4, as weights.
+
+    ``masked_mean(errors, hardest(errors))`` is ExtraNet's shading-augmented loss; FASSET divides by all pixels instead:
+    ``jnp.mean(errors * hardest(errors))``. Our reading: a pixel's error is the mean over its channels, and every image
+    of a batch has a set of its own. Pixels that tie for the last places share them.
+
+    Args:
+      errors: >= 0, ``[..., H, W, C]``, for example ``l1(prediction, target)``.
+      share: k over the number of pixels; k is at least 1.
+
+    Returns:
+      ``[..., H, W, 1]`` in [0, 1], no gradient; 1 on the k worst pixels, and k in sum over each image.
+
+    Raises:
+      ValueError: ``share`` is not in (0, 1].
+    """
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"share: expected a number in (0, 1], got {share}.")
+    error = jax.lax.stop_gradient(jnp.mean(errors, axis=-1))
+    flat = error.reshape(*error.shape[:-2], -1)
+    count = max(round(share * flat.shape[-1]), 1)
+    # A threshold instead of indices: the gradient of a gather is a scatter.
+    threshold = jax.lax.top_k(flat, count)[0][..., -1:]
+    above, ties = flat > threshold, flat == threshold
+    left = count - jnp.sum(above, axis=-1, keepdims=True)
+    weights = jnp.where(above, 1.0, jnp.where(ties, left / jnp.sum(ties, axis=-1, keepdims=True), 0.0))
+    return weights.reshape(error.shape)[..., None].astype(errors.dtype)

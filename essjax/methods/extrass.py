@@ -21,7 +21,15 @@ from essjax.frames import (
     surface_guides,
 )
 from essjax.interfaces import Method, MethodInfo, Network, no_variables, reset_at_cut
-from essjax.methods.rendered import GUIDED, RenderedPair, advance, guided_extrapolation, push, reset_pair, start_pair
+from essjax.methods.rendered import (
+    GUIDED,
+    Memory,
+    advance,
+    guided_extrapolation,
+    push_pair,
+    reset_memory,
+    start_pair,
+)
 from essjax.methods.taau import Resampled, gaussian_resample
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
@@ -57,7 +65,7 @@ def extrass_w(
         return _store(history, frame), Prediction(image=rendered_color(frame, info.name))
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history = advance(reset_pair(frame.cut, start_pair(frame), history), frame)
+        history = advance(reset_memory(frame.cut, start_pair(frame), history), frame)
         newest = select_time(history.frames, 0)
         image = guided_extrapolation(newest, frame, sigma_guide=sigma_guide, sigma_distance=sigma_distance)
         return history, Prediction(image=image, aux={"warp": image})
@@ -66,8 +74,8 @@ def extrass_w(
     return Method(no_variables, start_pair, render_step, extrapolate_step, info)
 
 
-def _store(history: RenderedPair, frame: Frame) -> RenderedPair:
-    return push(advance(reset_pair(frame.cut, start_pair(frame), history), frame), frame)
+def _store(history: Memory, frame: Frame) -> Memory:
+    return push_pair(advance(reset_memory(frame.cut, start_pair(frame), history), frame), frame)
 
 
 def halve(image: Image) -> Image:
@@ -134,7 +142,7 @@ class Extrapolated:
     mask: Mask
 
 
-def _extrapolate(network: Network, variables: PyTree, pair: RenderedPair, frame: Frame, sigmas: dict) -> Extrapolated:
+def _extrapolate(network: Network, variables: PyTree, pair: Memory, frame: Frame, sigmas: dict) -> Extrapolated:
     # Rendered frames carry no parameters: without stop_gradient the warps' backward pass would be computed for nothing.
     warped = jax.lax.stop_gradient(guided_extrapolation(pair.frames, frame, **sigmas))
     refined = refine(network, variables, warped, frame.gbuffers)
@@ -172,7 +180,7 @@ def extrass_e(
         return _store(history, frame), Prediction(image=rendered_color(frame, info.name))
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history = advance(reset_pair(frame.cut, start_pair(frame), history), frame)
+        history = advance(reset_memory(frame.cut, start_pair(frame), history), frame)
         result = _extrapolate(network, variables["frnet"], history, frame, sigmas)
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
@@ -193,7 +201,7 @@ class History:
       empty: bool ``[...]``: no output yet since the cut.
     """
 
-    rendered: RenderedPair
+    rendered: Memory
     image: Color
     gbuffers: GBuffers
     jitter: Jitter
@@ -302,7 +310,7 @@ def extrass(
 
     def reset(frame: Frame, history: History) -> History:
         fresh = start(frame)
-        rendered = reset_pair(frame.cut, fresh.rendered, history.rendered)
+        rendered = reset_memory(frame.cut, fresh.rendered, history.rendered)
         rest = reset_at_cut(
             frame.cut, dataclasses.replace(fresh, rendered=None), dataclasses.replace(history, rendered=None)
         )
@@ -341,7 +349,7 @@ def extrass(
         high = [space_to_depth(current.color, scale), space_to_depth(warped.log_image, scale)]
         return jnp.concatenate([*high, *low], axis=-1), current
 
-    def _finish(history: History, frame: Frame, rendered: RenderedPair, log_image: Image) -> tuple[History, Color]:
+    def _finish(history: History, frame: Frame, rendered: Memory, log_image: Image) -> tuple[History, Color]:
         image = expm1(log_image)
         history = dataclasses.replace(
             history,
@@ -361,7 +369,7 @@ def extrass(
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
         weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98)
         log_image = _compose(head, warped, current, weight, scale)
-        rendered = push(advance(history.rendered, frame), frame)
+        rendered = push_pair(advance(history.rendered, frame), frame)
         history, image = _finish(history, frame, rendered, log_image)
         aux = {"log_image": log_image, "warped": warped, "features": features}
         return history, Prediction(image=image, aux=aux)

@@ -1,4 +1,7 @@
-"""The two latest rendered frames and the paths back to them: ExtraSS's low-resolution memory (sections 4.2, 4.3)."""
+"""The latest rendered frames and the paths back to them: the low-resolution memory of methods that extrapolate.
+
+ExtraSS keeps two frames (sections 4.2, 4.3), ExtraNet three (section 4.1); what a method keeps of each is its own.
+"""
 
 import dataclasses
 
@@ -8,7 +11,7 @@ import jax.numpy as jnp
 from essjax.color import demodulate, demodulation_albedo, modulate
 from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
 from essjax.interfaces import expand_flag, reset_at_cut
-from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, pytree
+from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
 from essjax.warp import compose_motion, gbuffer_guided_warp, guides, jittered_motion
 
 GUIDED = frozenset({"base_color", "normal"})
@@ -17,29 +20,27 @@ GUIDED = frozenset({"base_color", "normal"})
 
 @pytree
 class Rendered:
-    """Rendered frames and the paths from the latest frame back to them; [2, ...]: the newest and the older one.
+    """Rendered frames and the paths from the latest frame back to them; the first of ``[K, ...]`` is the newest.
 
     Attributes:
-      shading: demodulated colour ``[2, ..., H, W, 3]``.
-      guide: base colour and normal ``[2, ..., H, W, 6]``.
-      jitter: ``[2, ..., 2]``.
-      motion: ``[2, ..., H, W, 2]`` composed motion from the latest frame's samples to that frame, unjittered.
-      valid: ``[2, ..., H, W, 1]``: 1 where that path stays on screen.
+      content: what the method keeps of a frame, a pytree of ``[K, ..., H, W, C]``.
+      jitter: ``[K, ..., 2]``.
+      motion: ``[K, ..., H, W, 2]`` composed motion from the latest frame's samples to that frame, unjittered.
+      valid: ``[K, ..., H, W, 1]``: 1 where that path stays on screen.
     """
 
-    shading: Color
-    guide: Image
+    content: PyTree
     jitter: Jitter
     motion: Motion
     valid: Mask
 
 
 @pytree
-class RenderedPair:
-    """The two latest rendered frames.
+class Memory:
+    """The K latest rendered frames.
 
     Attributes:
-      frames: stacked: t-1 and t-3 in the alternation; equal while only one has been rendered.
+      frames: stacked: t-1, t-3, ... in the alternation; places that no frame has taken yet hold the oldest one.
       count: ``[...]`` number rendered since the last cut.
       jitter: ``[..., 2]`` of the latest frame, rendered or not.
     """
@@ -49,83 +50,117 @@ class RenderedPair:
     jitter: Jitter
 
 
-def albedo(gbuffers: GBuffers) -> Color:
-    """The demodulation divisor of these G-buffers."""
-    base_color, _ = surface_guides(gbuffers)
-    return demodulation_albedo(base_color, background(gbuffers), gbuffers.metallic, gbuffers.specular)
+def start_memory(example: Frame, content: PyTree, frames: int) -> Memory:
+    """A memory of nothing, for ``frames`` frames of the shapes of ``example`` and ``content``."""
+
+    def repeat(leaf: Array) -> Array:
+        return jnp.broadcast_to(leaf, (frames, *leaf.shape))
+
+    fresh = jax.tree.map(repeat, _remember(example, content))
+    return Memory(frames=fresh, count=jnp.zeros(example.cut.shape, jnp.int32), jitter=jnp.copy(example.jitter))
 
 
-def _remember(frame: Frame) -> Rendered:
+def _remember(frame: Frame, content: PyTree) -> Rendered:
     """A frame that was just rendered: no way back to go."""
     return Rendered(
-        shading=demodulate(rendered_color(frame, "extrass"), albedo(frame.gbuffers)),
-        guide=guides(frame.gbuffers),
+        content=content,
         jitter=frame.jitter,
         motion=jnp.zeros_like(frame.motion),
         valid=jnp.ones_like(frame.gbuffers.depth),
     )
 
 
-def start_pair(example: Frame) -> RenderedPair:
-    """A memory of nothing, with the shapes of ``example`` (whose colour may be None)."""
-    empty = _remember(dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3))))
-    count = jnp.zeros(example.cut.shape, jnp.int32)
-    return RenderedPair(frames=jax.tree.map(_twice, empty), count=count, jitter=jnp.copy(example.jitter))
-
-
-def reset_pair(cut: Flag, fresh: RenderedPair, pair: RenderedPair) -> RenderedPair:
-    """``fresh`` where ``cut``: ``interfaces.reset_at_cut`` for leaves that carry the pair's axis in front."""
+def reset_memory(cut: Flag, fresh: Memory, memory: Memory) -> Memory:
+    """``fresh`` where ``cut``: ``interfaces.reset_at_cut`` for leaves that carry the memory's axis in front."""
 
     def choose(new: Array, old: Array) -> Array:
         return jnp.where(expand_flag(cut, new.ndim - 1), new, old)
 
-    frames = jax.tree.map(choose, fresh.frames, pair.frames)
-    rest = {name: reset_at_cut(cut, getattr(fresh, name), getattr(pair, name)) for name in ("count", "jitter")}
-    return RenderedPair(frames=frames, **rest)
+    frames = jax.tree.map(choose, fresh.frames, memory.frames)
+    rest = {name: reset_at_cut(cut, getattr(fresh, name), getattr(memory, name)) for name in ("count", "jitter")}
+    return Memory(frames=frames, **rest)
 
 
-def _twice(leaf: Array) -> Array:
-    return jnp.stack([leaf, leaf])
+def advance(memory: Memory, frame: Frame) -> Memory:
+    """Extend all paths by the motion of ``frame``, so that they start at its samples."""
+    previous = memory.frames
 
+    def share(leaf: Array) -> Array:
+        return jnp.broadcast_to(leaf, (previous.motion.shape[0], *leaf.shape))
 
-def advance(pair: RenderedPair, frame: Frame) -> RenderedPair:
-    """Extend both paths by the motion of ``frame``, so that they start at its samples."""
     motion, valid = compose_motion(
-        _twice(frame.motion),
-        pair.frames.motion,
-        jitter=_twice(frame.jitter),
-        jitter_previous=_twice(pair.jitter),
-        valid_previous=pair.frames.valid,
+        share(frame.motion),
+        previous.motion,
+        jitter=share(frame.jitter),
+        jitter_previous=share(memory.jitter),
+        valid_previous=previous.valid,
     )
-    frames = dataclasses.replace(pair.frames, motion=motion, valid=valid)
-    return dataclasses.replace(pair, frames=frames, jitter=frame.jitter)
+    return dataclasses.replace(
+        memory, frames=dataclasses.replace(previous, motion=motion, valid=valid), jitter=frame.jitter
+    )
 
 
-def push(pair: RenderedPair, frame: Frame) -> RenderedPair:
-    """Add a rendered frame to a memory that was advanced to it."""
+def push(memory: Memory, frame: Frame, content: PyTree) -> Memory:
+    """Add a rendered frame, of which ``content`` is kept, to a memory that was advanced to it."""
 
     def shift(new: Array, old: Array) -> Array:
-        return jnp.stack([new, jnp.where(expand_flag(pair.count == 0, new.ndim), new, old[0])])
+        older = jnp.where(expand_flag(memory.count == 0, new.ndim), new, old[:-1])
+        return jnp.concatenate([new[None], older])
 
-    frames = jax.tree.map(shift, _remember(frame), pair.frames)
-    return dataclasses.replace(pair, frames=frames, count=pair.count + 1)
+    frames = jax.tree.map(shift, _remember(frame, content), memory.frames)
+    return dataclasses.replace(memory, frames=frames, count=memory.count + 1)
+
+
+def albedo(gbuffers: GBuffers) -> Color:
+    """The demodulation divisor of these G-buffers."""
+    base_color, _ = surface_guides(gbuffers)
+    return demodulation_albedo(base_color, background(gbuffers), gbuffers.metallic, gbuffers.specular)
+
+
+@pytree
+class Shading:
+    """What guided warps keep of a rendered frame.
+
+    Attributes:
+      shading: demodulated colour ``[..., H, W, 3]``.
+      guide: base colour and normal ``[..., H, W, 6]``.
+    """
+
+    shading: Color
+    guide: Image
+
+
+def _shading(frame: Frame) -> Shading:
+    shading = demodulate(rendered_color(frame, "extrass"), albedo(frame.gbuffers))
+    return Shading(shading=shading, guide=guides(frame.gbuffers))
+
+
+def start_pair(example: Frame) -> Memory:
+    """ExtraSS's memory of nothing, with the shapes of ``example`` (whose colour may be None)."""
+    black = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3)))
+    return start_memory(example, _shading(black), 2)
+
+
+def push_pair(memory: Memory, frame: Frame) -> Memory:
+    """``push`` of what guided warps need."""
+    return push(memory, frame, _shading(frame))
 
 
 def guided_extrapolation(
     rendered: Rendered, frame: Frame, *, sigma_guide: float | tuple[float, ...], sigma_distance: float
 ) -> Color:
-    """f_g: rendered frames warped to ``frame``'s samples, ``[2, ..., H, W, 3]`` (or without the pair's axis; eq 1-3).
+    """f_g: rendered frames warped to ``frame``'s samples, ``[2, ..., H, W, 3]`` (or without that axis; eq 1-3).
 
     Shading is warped and modulated with the *current* base colour (section 4.2).
     """
-    like = rendered.shading.shape[: -frame.motion.ndim]  # (2,) or ()
+    like = rendered.motion.shape[: -frame.motion.ndim]  # (2,) or ()
 
     def share(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, like + leaf.shape)
 
     shading = gbuffer_guided_warp(
-        rendered.shading,
-        rendered.guide,
+        rendered.content.shading,
+        rendered.content.guide,
         share(guides(frame.gbuffers)),
         jittered_motion(rendered.motion, share(frame.jitter), rendered.jitter),
         sigma_guide=sigma_guide,

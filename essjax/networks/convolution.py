@@ -1,39 +1,38 @@
-"""A stride-1 convolution whose gradient stays fast inside ``lax.scan`` on CPUs.
+"""Convolutions whose gradients stay fast inside ``lax.scan`` on CPUs.
 
 XLA:CPU lays out the gradients of a convolution in a loop such that they miss its fast routine and run about 20 times
-slower (docs/adr/0006-scan-friendly-convolution.md). Written out as plain NHWC convolutions they do not. On other
-backends the ordinary convolution is used.
+slower (docs/adr/0006-scan-friendly-convolution.md). Written out as plain NHWC convolutions they do not. A strided one
+becomes a stride-1 convolution of blocks first. On other backends the ordinary convolution is used.
 """
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
+Padding = tuple[tuple[int, int], tuple[int, int]]
 
 
-@jax.custom_vjp
-def _convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=_NHWC)
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _convolve(x: jax.Array, kernel: jax.Array, padding: Padding) -> jax.Array:
+    return lax.conv_general_dilated(x, kernel, (1, 1), padding, dimension_numbers=_NHWC)
 
 
-def _forward(x, kernel):
-    return _convolve(x, kernel), (x, kernel)
+def _forward(x, kernel, padding):
+    return _convolve(x, kernel, padding), (x, kernel)
 
 
-def _backward(residuals, gradient):
+def _backward(padding, residuals, gradient):
     x, kernel = residuals
     flipped = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
-    dx = lax.conv_general_dilated(gradient, flipped, (1, 1), "SAME", dimension_numbers=_NHWC)
+    reverse = [(size - 1 - low, size - 1 - high) for size, (low, high) in zip(kernel.shape, padding, strict=False)]
+    dx = lax.conv_general_dilated(gradient, flipped, (1, 1), reverse, dimension_numbers=_NHWC)
     # The kernel's gradient correlates input and output gradient: channels take the place of the batch, the image that
     # of the kernel.
-    height, width = kernel.shape[0] // 2, kernel.shape[1] // 2
     dw = lax.conv_general_dilated(
-        jnp.transpose(x, (3, 1, 2, 0)),
-        jnp.transpose(gradient, (1, 2, 0, 3)),
-        (1, 1),
-        [(height, height), (width, width)],
-        dimension_numbers=_NHWC,
+        jnp.transpose(x, (3, 1, 2, 0)), jnp.transpose(gradient, (1, 2, 0, 3)), (1, 1), padding, dimension_numbers=_NHWC
     )
     return dx, jnp.transpose(dw, (1, 2, 0, 3))
 
@@ -41,18 +40,39 @@ def _backward(residuals, gradient):
 _convolve.defvjp(_forward, _backward)
 
 
-def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation=None, rhs_dilation=None, **options):
-    """``lax.conv_general_dilated`` for linen's ``conv_general_dilated=``: stride 1, odd kernel, "SAME", NHWC.
+def _by_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -> jax.Array:
+    """A strided convolution as a stride-1 convolution of ``stride`` x ``stride`` blocks that have become channels.
 
-    Anything else, and every backend but the CPU, falls through to the ordinary one.
+    The kernel gets zeros in front until it begins with a block, and behind until it ends with one.
     """
-    simple = tuple(window_strides) == (1, 1) and options.get("feature_group_count", 1) == 1
+    batch, height, width, channels = x.shape
+    front = [-low % stride for low, _ in padding]
+    blocks = [-(-(size + f) // stride) for size, f in zip(kernel.shape, front, strict=False)]
+    behind = [n * stride - size - f for n, size, f in zip(blocks, kernel.shape, front, strict=False)]
+    kernel = jnp.pad(kernel, [(front[0], behind[0]), (front[1], behind[1]), (0, 0), (0, 0)])
+    kernel = kernel.reshape(blocks[0], stride, blocks[1], stride, channels, -1).transpose(0, 2, 1, 3, 4, 5)
+    kernel = kernel.reshape(*blocks, stride * stride * channels, -1)
+    x = x.reshape(batch, height // stride, stride, width // stride, stride, channels).transpose(0, 1, 3, 2, 4, 5)
+    x = x.reshape(batch, height // stride, width // stride, stride * stride * channels)
+    lows = [-(-low // stride) for low, _ in padding]
+    return _convolve(x, kernel, tuple((low, n - 1 - low) for low, n in zip(lows, blocks, strict=True)))
+
+
+def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation=None, rhs_dilation=None, **options):
+    """``lax.conv_general_dilated`` for linen's ``conv_general_dilated=``: NHWC, on the CPU with gradients of our own.
+
+    They need a kernel no larger than its padding allows: an output as large as the input (stride 1), or one pixel per
+    ``stride`` x ``stride`` block (sizes must be multiples of the stride). Anything else, and every backend but the CPU,
+    falls through to the ordinary one.
+    """
+    sizes, strides = lhs.shape[1:3], tuple(window_strides)
+    simple = options.get("feature_group_count", 1) == 1 and jax.default_backend() == "cpu"
     simple &= all(d in (None, (1, 1), [1, 1]) or tuple(d) == (1, 1) for d in (lhs_dilation, rhs_dilation))
-    simple &= rhs.shape[0] % 2 == 1 and rhs.shape[1] % 2 == 1
-    same = [((n - 1) // 2, n // 2) for n in rhs.shape[:2]]
-    simple &= padding == "SAME" or [tuple(p) for p in padding] == same
-    if simple and jax.default_backend() == "cpu":
-        return _convolve(lhs, rhs)
+    if simple and strides[0] == strides[1] and all(size % strides[0] == 0 for size in sizes):
+        pairs = lax.padtype_to_pads(sizes, rhs.shape[:2], strides, padding) if isinstance(padding, str) else padding
+        pairs = tuple((int(low), int(high)) for low, high in pairs)
+        if all(n - strides[0] <= low + high < n and low < n for n, (low, high) in zip(rhs.shape, pairs, strict=False)):
+            return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _by_blocks(lhs, rhs, strides[0], pairs)
     return lax.conv_general_dilated(
         lhs, rhs, window_strides, padding, lhs_dilation=lhs_dilation, rhs_dilation=rhs_dilation, **options
     )

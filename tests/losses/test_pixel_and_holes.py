@@ -5,7 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from essjax.losses import charbonnier, feature_l1, l1, masked_mean, occlusion, sum_of_means, temporal_l1
+from essjax.losses import (
+    charbonnier,
+    feature_l1,
+    hardest,
+    l1,
+    masked_mean,
+    occlusion,
+    spatio_temporal,
+    sum_of_means,
+    temporal_l1,
+)
 from tests.helpers import random_image
 
 pytestmark = pytest.mark.usefixtures("strict_numerics")
@@ -74,6 +84,28 @@ def test_occlusion_by_hand():
     assert float(masked_mean(occlusion(prediction, target, 0.0 * hole), 0.0 * hole)) == 0.0
 
 
+@given(seed=SEEDS)
+def test_hardest_pixels_match_a_sort(seed):
+    """Eq 6 per image: the mean over the 35 pixels' worst tenth (4 of them), channels averaged first."""
+    errors = random_image(seed, *SHAPE)
+    weights = jax.jit(hardest)(errors)
+    worst = np.sort(np.asarray(errors, np.float64).mean(axis=-1).reshape(2, -1), axis=-1)[:, -4:]
+    assert weights.shape == (2, 5, 7, 1) and set(np.unique(weights)) == {0.0, 1.0}
+    np.testing.assert_array_equal(weights.sum(axis=(1, 2, 3)), 4.0)
+    assert float(masked_mean(errors, weights)) == pytest.approx(worst.mean(), rel=1e-5)
+    assert float(jnp.mean(errors * weights)) == pytest.approx(worst.sum() / 70, rel=1e-5)
+
+
+def test_hardest_pixels_share_ties_and_have_no_gradient():
+    errors = jnp.array([[[2.0], [1.0], [1.0], [0.0], [1.0], [0.0]]])  # one row of six pixels
+    np.testing.assert_allclose(hardest(errors, share=0.5)[0, :, 0], [1, 2 / 3, 2 / 3, 0, 2 / 3, 0], rtol=1e-6)
+    np.testing.assert_array_equal(hardest(errors, share=1e-6)[0, :, 0], [1, 0, 0, 0, 0, 0])  # at least one
+    gradient = jax.grad(lambda x: masked_mean(x, hardest(x, share=0.5)))(errors)
+    np.testing.assert_allclose(gradient[0, :, 0], np.array([1, 2 / 3, 2 / 3, 0, 2 / 3, 0]) / 3, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"share: expected a number in \(0, 1\], got 0"):
+        hardest(errors, share=0)
+
+
 def test_temporal_l1_looks_at_valid_pixels_only():
     image, warped = random_image(1, *SHAPE), random_image(2, *SHAPE)
     valid = jnp.asarray(np.random.default_rng(0).uniform(size=(*SHAPE[:-1], 1)) < 0.5, jnp.float32)
@@ -99,3 +131,19 @@ def test_feature_l1_per_level():
     assert float(sum_of_means([])) == 0.0
     with pytest.raises(ValueError, match="as many levels on both sides, got 2 and 1"):
         feature_l1(a, b[:1])
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.3, 1.0])
+def test_spatio_temporal_is_equation_54(theta):
+    x, y = (np.asarray(random_image(seed, *SHAPE, low=-1.0, high=1.0), np.float64) for seed in (1, 2))
+    expected = np.abs(x) + np.abs(y) + theta * (np.abs(x - y) - np.abs(x) - np.abs(y))
+    got = spatio_temporal(jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), theta=theta)
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_spatio_temporal_messages():
+    image = jnp.zeros((5, 7, 3))
+    with pytest.raises(ValueError, match=r"theta: expected a share in \[0, 1\], got 1.5"):
+        spatio_temporal(image, image, theta=1.5)
+    with pytest.raises(ValueError, match="error and error_previous: expected the same shape"):
+        spatio_temporal(image, image[..., :1], theta=0.5)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 
 from essjax.color import demodulate
 from essjax.frames import select_time, without_color
-from essjax.methods.rendered import advance, albedo, push, reset_pair, start_pair
+from essjax.methods.rendered import advance, albedo, push, push_pair, reset_memory, start_memory, start_pair
 from tests.helpers import make_frames, random_image
 
 T, B, H, W = 4, 2, 7, 10
@@ -28,7 +28,7 @@ def walk(frames):
     for n in range(T):
         frame = select_time(frames, n)
         pair = advance(pair, frame)
-        pair = push(pair, frame) if n % 2 == 0 else pair
+        pair = push_pair(pair, frame) if n % 2 == 0 else pair
         memories.append(pair)
     return memories
 
@@ -39,17 +39,41 @@ def test_what_is_remembered():
     shading = demodulate(frames.color, albedo(frames.gbuffers))
     for memory in (first, second):  # one frame so far: the older one is the newest
         jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf[0], leaf[1]), memory.frames)
-        np.testing.assert_allclose(memory.frames.shading[0], shading[0], rtol=1e-6)
+        np.testing.assert_allclose(memory.frames.content.shading[0], shading[0], rtol=1e-6)
         np.testing.assert_array_equal(memory.count, [1, 1])
     for memory in (third, fourth):
-        np.testing.assert_allclose(memory.frames.shading, shading[jnp.array([2, 0])], rtol=1e-6)
-        np.testing.assert_array_equal(memory.frames.guide[..., :3], frames.gbuffers.base_color[jnp.array([2, 0])])
+        np.testing.assert_allclose(memory.frames.content.shading, shading[jnp.array([2, 0])], rtol=1e-6)
+        np.testing.assert_array_equal(
+            memory.frames.content.guide[..., :3], frames.gbuffers.base_color[jnp.array([2, 0])]
+        )
         np.testing.assert_array_equal(memory.frames.jitter, frames.jitter[jnp.array([2, 0])])
         np.testing.assert_array_equal(memory.count, [2, 2])
     np.testing.assert_array_equal(third.frames.motion[0], 0.0)
     np.testing.assert_array_equal(third.frames.valid[0], 1.0)
     for n, memory in enumerate((first, second, third, fourth)):
         np.testing.assert_array_equal(memory.jitter, frames.jitter[n])
+
+
+def test_more_frames_and_other_contents():
+    """Three places: rendered frames 0, 1, 3; a place that is still empty holds the oldest."""
+    frames = random_frames(4)
+
+    @jax.jit
+    def run(frames):
+        memory = start_memory(select_time(frames, 0), {"depth": jnp.zeros_like(frames.gbuffers.depth[0])}, 3)
+        seen = []
+        for n in range(T):
+            frame = select_time(frames, n)
+            memory = advance(memory, frame)
+            memory = memory if n == 2 else push(memory, frame, {"depth": frame.gbuffers.depth})
+            seen.append(memory)
+        return seen
+
+    for memory, held in zip(run(frames), ([0, 0, 0], [1, 0, 0], [1, 0, 0], [3, 1, 0]), strict=True):
+        np.testing.assert_array_equal(memory.frames.content["depth"], frames.gbuffers.depth[jnp.array(held)])
+        np.testing.assert_array_equal(memory.frames.jitter, frames.jitter[jnp.array(held)])
+        assert memory.frames.motion.shape == (3, B, H, W, 2)
+    np.testing.assert_array_equal(memory.frames.motion[0], 0.0)
 
 
 def follow(motions, first, last):
@@ -107,8 +131,8 @@ def test_jitter_moves_the_lookup_and_not_the_motion():
 def test_reset_only_where_cut():
     frames = random_frames(3)
     memory, fresh = walk(frames)[-1], start_pair(without_color(select_time(frames, 3)))
-    mixed = reset_pair(jnp.array([False, True]), fresh, memory)
+    mixed = reset_memory(jnp.array([False, True]), fresh, memory)
     jax.tree.map(lambda new, old: np.testing.assert_array_equal(new[:, 0], old[:, 0]), mixed.frames, memory.frames)
     jax.tree.map(lambda new, old: np.testing.assert_array_equal(new[:, 1], old[:, 1]), mixed.frames, fresh.frames)
     np.testing.assert_array_equal(mixed.count, [2, 0])
-    np.testing.assert_array_equal(fresh.frames.shading, 0.0)
+    np.testing.assert_array_equal(fresh.frames.content.shading, 0.0)

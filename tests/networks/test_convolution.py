@@ -13,31 +13,50 @@ from tests.helpers import random_image
 NHWC = ("NHWC", "HWIO", "NHWC")
 
 
-def plain(x, kernel):
-    return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=NHWC)
+def plain(x, kernel, strides=(1, 1), padding="SAME"):
+    return lax.conv_general_dilated(x, kernel, strides, padding, dimension_numbers=NHWC)
 
 
-def friendly(x, kernel):
-    return scan_friendly_convolution(x, kernel, (1, 1), "SAME", dimension_numbers=NHWC)
+def friendly(x, kernel, strides=(1, 1), padding="SAME"):
+    return scan_friendly_convolution(x, kernel, strides, padding, dimension_numbers=NHWC)
 
 
-@pytest.mark.parametrize("size", [(3, 3), (1, 5)], ids=["3x3", "1x5"])
-def test_value_and_gradients_equal_the_plain_convolution(size):
-    x, kernel = random_image(0, 2, 5, 8, 3, low=-1.0), random_image(1, *size, 3, 4, low=-1.0)
-    target = random_image(2, 2, 5, 8, 4)  # asymmetric: a flipped kernel or swapped axes cannot cancel
+@pytest.mark.parametrize(
+    ("size", "stride", "padding"),
+    [
+        ((3, 3), 1, "SAME"),
+        ((1, 5), 1, "SAME"),
+        ((2, 4), 1, "SAME"),
+        ((3, 3), 2, [(1, 1), (1, 1)]),
+        ((3, 3), 2, "SAME"),
+        ((4, 4), 4, "VALID"),
+        ((5, 4), 2, [(3, 1), (0, 2)]),
+    ],
+    ids=["3x3", "1x5", "even", "stride-2", "stride-2-same", "blocks", "lopsided"],
+)
+def test_value_and_gradients_equal_the_plain_convolution(monkeypatch, size, stride, padding):
+    x, kernel = random_image(0, 2, 4, 8, 3, low=-1.0), random_image(1, *size, 3, 4, low=-1.0)
+    target = random_image(2, 2, 4 // stride, 8 // stride, 4)  # asymmetric: no flip and no swap of axes can cancel
 
     @jax.jit
     def evaluate(x, kernel):
         def loss(function):
-            return lambda x, kernel: jnp.sum(function(x, kernel) * target)
+            return lambda x, kernel: jnp.sum(function(x, kernel, (stride, stride), padding) * target)
 
-        values = friendly(x, kernel), plain(x, kernel)
+        values = [function(x, kernel, (stride, stride), padding) for function in (friendly, plain)]
         return values, [jax.grad(loss(function), argnums=(0, 1))(x, kernel) for function in (friendly, plain)]
 
     (ours, theirs), (our_gradients, their_gradients) = evaluate(x, kernel)
     np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
     for ours, theirs in zip(our_gradients, their_gradients, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
+    monkeypatch.setattr(convolution, "_convolve", _refuse)
+    with pytest.raises(AssertionError, match="must not take"):  # it was the special case
+        friendly(x, kernel, (stride, stride), padding)
+
+
+def _refuse(x, kernel, padding):
+    raise AssertionError("the special case must not take this convolution")
 
 
 @pytest.mark.parametrize(
@@ -45,20 +64,15 @@ def test_value_and_gradients_equal_the_plain_convolution(size):
     [
         ((3, 3, 3, 2), (2, 2), "SAME", {}),
         ((3, 3, 3, 2), (1, 1), "VALID", {}),
-        ((2, 2, 3, 2), (1, 1), "SAME", {}),
+        ((3, 3, 3, 2), (2, 1), "SAME", {}),
         ((3, 3, 3, 2), (1, 1), "SAME", {"rhs_dilation": (2, 2)}),
         ((3, 3, 1, 3), (1, 1), "SAME", {"feature_group_count": 3}),
     ],
-    ids=["stride", "valid", "even", "dilated", "grouped"],
+    ids=["odd-size", "valid", "two-strides", "dilated", "grouped"],
 )
 def test_everything_else_falls_through(monkeypatch, shape, strides, padding, options):
-    def refuse(x, kernel):
-        raise AssertionError("the special case must not take this convolution")
-
-    monkeypatch.setattr(convolution, "_convolve", refuse)
+    monkeypatch.setattr(convolution, "_convolve", _refuse)
     x, kernel = random_image(0, 1, 5, 8, 3), random_image(1, *shape)
     arguments = (x, kernel, strides, padding)
     result = scan_friendly_convolution(*arguments, dimension_numbers=NHWC, **options)
     np.testing.assert_array_equal(result, lax.conv_general_dilated(*arguments, dimension_numbers=NHWC, **options))
-    with pytest.raises(AssertionError, match="must not take"):
-        friendly(x, random_image(1, 3, 3, 3, 2))
