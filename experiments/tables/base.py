@@ -7,12 +7,15 @@ import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from essjax.deploy import Cost
+
 
 class Metric(NamedTuple):
     """One measured quantity of a table.
 
     Attributes:
-      key: its name in the rows of ``metrics.json``; None where it is not measured yet (VMAF, LPIPS): shown as a dash.
+      key: its name in the rows of ``metrics.json``; "cost.parameters" (millions) or "cost.multiply_adds" (10^9 per
+        frame of this kind); None where it is not measured yet (VMAF, LPIPS): shown as a dash.
       frames: "ss" or "ess".
       resolution: "hr" or "lr".
       digits: decimals shown.
@@ -51,7 +54,6 @@ class Table(NamedTuple):
       paper: row label -> metric label -> the paper's number per scene (None: not given).
       settings: ``--set`` of the comparison behind it, beyond the preset.
       note: what a reader must know, one or two sentences.
-      group: metric labels that the paper's order is judged by; all measured ones if empty.
     """
 
     name: str
@@ -76,12 +78,15 @@ def paper_mean(table: Table, row: str, metric: str) -> float | None:
     return sum(values) / len(values) if values else None
 
 
-def measured(table: Table, metrics: Mapping[str, Any]) -> dict[str, dict[str, float | None]]:
+def measured(
+    table: Table, metrics: Mapping[str, Any], costs: Mapping[str, Cost] | None = None
+) -> dict[str, dict[str, float | None]]:
     """Row label -> metric label -> our number, the mean over test sequences; None where there is none.
 
     Args:
       table: which.
       metrics: the content of a comparison's ``metrics.json``.
+      costs: variant -> its cost, for tables that show it.
     """
     means = {
         (row["method"], row["frames"], row["resolution"]): row for row in metrics["rows"] if row["sequence"] == "mean"
@@ -91,8 +96,21 @@ def measured(table: Table, metrics: Mapping[str, Any]) -> dict[str, dict[str, fl
         found[label] = {}
         for name, metric in table.metrics.items():
             line = means.get((row.variant, row.frames or metric.frames, metric.resolution), {})
-            found[label][name] = line.get(metric.key) if row.variant and metric.key else None
+            if row.variant is None or metric.key is None:
+                found[label][name] = None
+            elif metric.key.startswith("cost."):
+                found[label][name] = _cost((costs or {}).get(row.variant), metric)
+            else:
+                found[label][name] = line.get(metric.key)
     return found
+
+
+def _cost(cost: Cost | None, metric: Metric) -> float | None:
+    if cost is None:
+        return None
+    if metric.key == "cost.parameters":
+        return cost.parameters / 1e6
+    return cost.multiply_adds.get(metric.frames, 0) / 1e9
 
 
 class Agreement(NamedTuple):

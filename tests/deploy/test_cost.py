@@ -20,9 +20,7 @@ def test_convolutions_by_hand():
     def strided(x, kernel, grouped):
         layout = ("NHWC", "HWIO", "NHWC")
         y = jax.lax.conv_general_dilated(x, kernel, (2, 2), "SAME", dimension_numbers=layout)
-        return jax.lax.conv_general_dilated(
-            y, grouped, (1, 1), "SAME", dimension_numbers=layout, feature_group_count=4
-        )
+        return jax.lax.conv_general_dilated(y, grouped, (1, 1), "SAME", dimension_numbers=layout, feature_group_count=4)
 
     count = multiply_adds(strided, struct(2, 6, 10, 3), struct(3, 5, 3, 4), struct(3, 3, 1, 8))
     assert count == 2 * 3 * 5 * 4 * (3 * 5 * 3) + 2 * 3 * 5 * 8 * (3 * 3 * 1)
