@@ -49,7 +49,10 @@ def test_tables_are_kept_as_they_are(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
     environment = {"commit": "abc", "device": "cpu", "seed": 0, "steps": {"a/b": 3}, "versions": {"jax": "1"}}
     run = {"tables": ["extrass-2"], "settings": ["scale=2"], "dataset": "d", "environment": environment, "seconds": {}}
-    ours = {label: {"PSNR": value} for label, value in zip(("ExtraNet", "IFRNet", "Ours-W", "Ours-E"), (3, 2, 4, 5))}
+    ours = {
+        label: {"PSNR": value}
+        for label, value in zip(("ExtraNet", "IFRNet", "Ours-W", "Ours-E"), (3, 2, 4, 5), strict=True)
+    }
     content = {"schema": 1, "kind": "tables", "preset": "quick", "runs": [run], "tables": {"extrass-2": ours}}
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "tables.json").write_text(json.dumps(content))
