@@ -122,7 +122,7 @@ def extranet(*, history: bool = True, occlusion: bool = True) -> Method:
 
     ``variables = {"extranet": {"params", "batch_stats"}}``, 262,141 parameters; ``from_torch`` reads published ones. A
     fresh network returns the plain warp of the demodulated frame. ``aux`` of an extrapolated step: ``log_shading`` (the
-    output, demodulated, log1p), ``valid`` (the mask) and ``warp`` (the plain warp, linear).
+    output, demodulated, log1p) and ``inputs`` (``Inputs``).
 
     Args:
       history: with the history encoder (Table 7, HE).
@@ -144,13 +144,8 @@ def extranet(*, history: bool = True, occlusion: bool = True) -> Method:
         seen = network_inputs(memory, frame, occlusion=occlusion)
         inputs = seen.warped, seen.mask, seen.features, seen.history
         log_shading, state = network.apply(variables["extranet"], *inputs, train=train)
-        divisor = albedo(frame.gbuffers)
-        aux = {
-            "log_shading": log_shading,
-            "valid": seen.mask,
-            "warp": modulate(expm1(seen.warped[..., :3]), divisor),
-        }
-        image = modulate(expm1(log_shading), divisor)
+        image = modulate(expm1(log_shading), albedo(frame.gbuffers))
+        aux = {"log_shading": log_shading, "inputs": seen}
         return memory, Prediction(image=image, aux=aux, state={"extranet": state} if state else {})
 
     info = MethodInfo("extranet", scale=1, requires=REQUIRES, predicts=frozenset({"ess"}))
