@@ -75,6 +75,11 @@ def display(color: Image) -> Image:
     return srgb_encode(reinhard(color))
 
 
+def display_inverse(encoded: Color) -> Color:
+    """Inverse of ``display``; what is outside [0, 1) is clamped so that the result is finite and >= 0."""
+    return reinhard_inverse(srgb_decode(jnp.clip(encoded, 0.0, 1.0)))
+
+
 def rgb_to_ycocg(rgb: Color) -> Color:
     """Luma and two chroma differences (Malvar and Sullivan 2003); linear, exactly invertible in reals."""
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]

@@ -14,6 +14,7 @@ PAIRS = {
     "log1p": (color.log1p, color.expm1, 50.0),
     "reinhard": (color.reinhard, color.reinhard_inverse, 50.0),
     "srgb": (color.srgb_encode, color.srgb_decode, 1.0),
+    "display": (color.display, color.display_inverse, 20.0),
     "ycocg": (color.rgb_to_ycocg, color.ycocg_to_rgb, 50.0),
 }
 
@@ -69,7 +70,7 @@ def test_ycocg_and_luminance_by_hand():
 
 
 def test_negative_input_counts_as_zero():
-    for transform in (color.log1p, color.expm1, color.reinhard, color.reinhard_inverse):
+    for transform in (color.log1p, color.expm1, color.reinhard, color.reinhard_inverse, color.display_inverse):
         assert float(transform(jnp.array(-0.5))) == 0.0
 
 

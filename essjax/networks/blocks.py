@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from essjax.networks.convolution import scan_friendly_convolution
 from essjax.networks.linen import kernel_bound
-from essjax.typing import Image
+from essjax.typing import Array, Image
 
 
 def pad_to_multiple(image: Image, multiple: int) -> Image:
@@ -33,10 +33,11 @@ def nearest_upsample(image: Image, factor: int = 2) -> Image:
     return jnp.repeat(jnp.repeat(image, factor, axis=-3), factor, axis=-2)
 
 
-def bilinear_upsample(image: Image, factor: int = 2) -> Image:
-    """Bilinear upsampling, pixel centres at +0.5, borders replicated."""
-    *lead, height, width, channels = image.shape
-    return jax.image.resize(image, (*lead, height * factor, width * factor, channels), "linear")
+def bilinear_upsample(image: Image) -> Image:
+    """Twice the size by bilinear interpolation, pixel centres at +0.5, borders replicated."""
+    for axis in (-3, -2):
+        image = _double(image, axis, 0.25, 0.25)
+    return image
 
 
 def bilinear_upsample_corners(image: Image) -> Image:
@@ -44,16 +45,23 @@ def bilinear_upsample_corners(image: Image) -> Image:
     for axis in (-3, -2):
         size = image.shape[axis]
         index = jnp.arange(size, dtype=image.dtype).reshape(-1, *(1,) * (-1 - axis))
-        before, after = index / (2 * size - 1), (size - 1 - index) / (2 * size - 1)
-        # Outputs 2k and 2k + 1 lie a little before and after input k: no gather, whose gradient would be a scatter.
-        inner = [jax.lax.slice_in_dim(image, k, size - 1 + k, axis=axis % image.ndim) for k in (0, 1)]
-        first, last = (jax.lax.slice_in_dim(image, k, k + 1, axis=axis % image.ndim) for k in (0, size - 1))
-        previous, following = (jnp.concatenate(parts, axis) for parts in ([first, inner[0]], [inner[1], last]))
-        pair = [image + before * (previous - image), image + after * (following - image)]
-        shape = list(image.shape)
-        shape[axis] *= 2
-        image = jnp.stack(pair, axis=axis % image.ndim + 1).reshape(shape)
+        image = _double(image, axis, index / (2 * size - 1), (size - 1 - index) / (2 * size - 1))
     return image
+
+
+def _double(image: Image, axis: int, before: Array | float, after: Array | float) -> Image:
+    """Twice the pixels along ``axis``; outputs 2k and 2k + 1 lie a little before and after input k.
+
+    ``before`` is the share of input k - 1 in output 2k, ``after`` that of k + 1 in 2k + 1. Slices: the gradient of a
+    gather is a scatter, and a resize as matrix products is as much work as the convolutions.
+    """
+    axis, size = axis % image.ndim, image.shape[axis]
+    inner = [jax.lax.slice_in_dim(image, k, size - 1 + k, axis=axis) for k in (0, 1)]
+    first, last = (jax.lax.slice_in_dim(image, k, k + 1, axis=axis) for k in (0, size - 1))
+    previous, following = (jnp.concatenate(parts, axis) for parts in ([first, inner[0]], [inner[1], last]))
+    pair = [image + before * (previous - image), image + after * (following - image)]
+    shape = [2 * n if k == axis else n for k, n in enumerate(image.shape)]
+    return jnp.stack(pair, axis=axis + 1).reshape(shape)
 
 
 def conv(features: int, size: int = 3, stride: int = 1, **options) -> nn.Conv:
@@ -116,6 +124,15 @@ class GatedConv(nn.Module):
         both = conv(self.width + 1, self.size, self.stride)(x)
         x = nn.sigmoid(both[..., -1:]) * both[..., :-1]
         return nn.relu(batch_norm(train)(x)) if self.norm else x
+
+
+def replicated_conv(x: Image, features: int, size: int = 3, **options) -> Image:
+    """``conv`` with replicated borders; call it in a module's ``nn.compact`` method."""
+    radius = size // 2
+    pad = [(0, 0)] * (x.ndim - 3) + [(radius, radius), (radius, radius), (0, 0)]
+    # Cropped from the zero-padded convolution of the larger image: its gradient is the fast one.
+    wide = conv(features, size, **options)(jnp.pad(x, pad, mode="edge"))
+    return wide[..., radius:-radius, radius:-radius, :] if radius else wide
 
 
 class ConvBlock(nn.Module):

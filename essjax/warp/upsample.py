@@ -1,17 +1,23 @@
 """From low-resolution, jittered samples to a high-resolution grid, and blocks to channels and back."""
 
+import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
 from essjax.typing import Array, Image, Jitter, Positions
 from essjax.warp._batch import check_channels, over_leading_axes
-from essjax.warp.sampling import Tap, axis_taps, check_mode
+from essjax.warp.sampling import Tap, axis_taps, check_mode, gather_pixels, sample
 
 
 def _check_scale(scale: int, name: str = "scale") -> int:
     if int(scale) != scale or scale < 1:
         raise ValueError(f"{name}: expected a whole number >= 1, got {scale!r}.")
     return int(scale)
+
+
+def _sample_offset(jitter: Jitter, scale: int) -> Array:
+    """HR pixel ``[..., 2]`` (x, y), inside its LR pixel, that a sample fell into."""
+    return jnp.clip(jnp.floor((jitter + 0.5) * scale), 0, scale - 1)  # the clip is for rounding at 0.5
 
 
 def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Image:
@@ -30,11 +36,54 @@ def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Image:
     scale = _check_scale(scale)
     check_channels("image", image, None)
     height, width, channels = image.shape[-3:]
-    offset = jnp.clip(jnp.floor((jitter + 0.5) * scale), 0, scale - 1)  # the clip is for rounding at 0.5
+    offset = _sample_offset(jitter, scale)
     here = jnp.arange(scale) == offset[..., None]  # [..., 2, scale]: x, y
     hit = (here[..., 1, :, None] & here[..., 0, None, :])[..., None, :, None, :, None]
     blocks = jnp.where(hit, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
     return blocks.reshape(*blocks.shape[:-5], height * scale, width * scale, channels)
+
+
+def _sparse_taps(positions: Array, size: int, scale: int, offset: Array) -> Tap:
+    """Which LR pixel bilinear interpolation of the zero-upsampled axis meets, and its weight: one of two neighbours."""
+    index = jnp.zeros(positions.shape, jnp.int32)
+    weight = jnp.zeros(positions.shape, jnp.float32)
+    for tap in axis_taps(positions, size * scale, "bilinear", "zeros"):
+        hit = (tap.index % scale == offset) & (tap.weight > 0)
+        index = jnp.where(hit, tap.index // scale, index)
+        weight = jnp.where(hit, tap.weight, weight)
+    return Tap(index, weight)
+
+
+def sample_zero_upsampled(image: Image, positions: Positions, scale: int, jitter: Jitter) -> Image:
+    """``sample(zero_upsample(image, scale, jitter), positions, outside="zeros")`` without making the large image.
+
+    Of the four HR pixels that bilinear interpolation reads, one at most holds a sample: one gather instead of four,
+    and the gradient to the image is one scatter.
+
+    Args:
+      image: ``[..., H, W, C]``.
+      positions: ``[..., h, w, 2]`` (x, y) in HR pixels, centres at +0.5; no gradient.
+      scale: whole number.
+      jitter: ``[..., 2]`` (x, y) LR pixels in [-0.5, 0.5) of the image.
+
+    Returns:
+      ``[..., h, w, C]``.
+    """
+    scale = _check_scale(scale)
+    if scale == 1:
+        return sample(image, positions, outside="zeros")
+    check_channels("image", image, None)
+    check_channels("positions", positions, 2)
+
+    def one(image: Array, positions: Array, jitter: Array) -> Array:
+        height, width, channels = image.shape
+        offset = _sample_offset(jitter, scale).astype(jnp.int32)
+        column = _sparse_taps(positions[..., 0], width, scale, offset[0])
+        row = _sparse_taps(positions[..., 1], height, scale, offset[1])
+        value = gather_pixels(image.reshape(-1, channels), row.index * width + column.index)
+        return value * (row.weight * column.weight)[..., None].astype(image.dtype)
+
+    return over_leading_axes(one, (3, 3, 1), image, jax.lax.stop_gradient(positions), jnp.asarray(jitter))
 
 
 def _along(image: Array, taps: list[Tap], axis: int) -> Array:

@@ -1,11 +1,12 @@
-"""Building blocks against NumPy: gated convolution, BatchNorm, upsampling with corners on corners."""
+"""Building blocks against NumPy and other independent implementations."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from essjax.networks.blocks import ConvNorm, GatedConv, bilinear_upsample_corners
+from essjax.networks.blocks import ConvNorm, GatedConv, bilinear_upsample, bilinear_upsample_corners
 from essjax.networks.linen import from_linen
 from tests.helpers import random_image
 
@@ -60,12 +61,18 @@ def test_batch_norm_has_pytorchs_defaults():
     np.testing.assert_allclose(new["var"], 0.9 * running["var"] + 0.1 * variance, rtol=1e-4)
 
 
-@pytest.mark.parametrize("size", [(5, 3), (1, 2)])
-def test_upsampling_puts_corners_on_corners(size):
-    image = random_image(0, 2, *size, 3)
-    expected = np.asarray(image, np.float64)
-    for axis in (1, 2):  # numpy.interp at n positions from first to last
-        n = expected.shape[axis]
-        at = np.linspace(0, n - 1, 2 * n)
-        expected = np.apply_along_axis(lambda line, at=at, n=n: np.interp(at, np.arange(n), line), axis, expected)
-    np.testing.assert_allclose(jax.jit(bilinear_upsample_corners)(image), expected, rtol=1e-5, atol=1e-6)
+def test_bilinear_upsampling_equals_a_resize():
+    image = random_image(0, 2, 5, 8, 3)
+    expected = jax.image.resize(image, (2, 10, 16, 3), "linear")
+    np.testing.assert_allclose(jax.jit(bilinear_upsample)(image), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_upsampling_corners_on_corners_reads_where_pytorch_does():
+    image = np.asarray(random_image(1, 2, 5, 8, 3))
+    rows, columns = np.linspace(0, 4, 10), np.linspace(0, 7, 16)
+    grid = np.meshgrid(rows, columns, indexing="ij")
+    got = np.asarray(jax.jit(bilinear_upsample_corners)(image))
+    for b in range(2):
+        for c in range(3):
+            expected = ndimage.map_coordinates(image[b, ..., c], grid, order=1)
+            np.testing.assert_allclose(got[b, ..., c], expected, rtol=1e-5, atol=1e-6)

@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from essjax.cameras import pixel_positions
-from essjax.warp import depth_to_space, jitter_aligned_upsample, sample_distance, space_to_depth, zero_upsample
+from essjax.warp import (
+    depth_to_space,
+    jitter_aligned_upsample,
+    sample,
+    sample_distance,
+    sample_zero_upsampled,
+    space_to_depth,
+    zero_upsample,
+)
 
 H, W = 5, 8
 FEW = settings(max_examples=15, deadline=None)
@@ -48,6 +56,31 @@ def test_zero_upsampling_with_a_jitter_per_batch_element():
 def test_zero_jitter_at_even_scale_lands_right_and_below_the_centre():
     got = np.asarray(zeros(image_of(2), 2, jnp.zeros(2)))
     assert (got[1::2, 1::2] > 0).all() and (got[0::2] == 0).all()
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_reading_a_zero_upsampled_image_without_making_it(scale):
+    """Positions inside, on pixel centres, half outside and far outside; the gradient to the image too."""
+    image, rng = image_of(3, 2), np.random.default_rng(4)
+    jitter = np.float32([[-0.4, 0.3], [0.1, -0.2]])
+    size = np.float32([W * scale, H * scale])
+    positions = rng.uniform(-2.5, size + 2.5, (2, 9, 30, 2)).astype(np.float32)
+    positions[:, :3] = np.floor(positions[:, :3]) + 0.5
+
+    def direct(image):
+        return sample_zero_upsampled(image, positions, scale, jitter)
+
+    def through_the_large_image(image):
+        return sample(zero_upsample(image, scale, jitter), positions, outside="zeros")
+
+    weights = rng.normal(size=(2, 9, 30, 3)).astype(np.float32)
+    results = []
+    for read in (direct, through_the_large_image):
+        value, pullback = jax.jit(lambda image, read=read: jax.vjp(read, image))(image)
+        results.append((value, pullback(weights)[0]))
+    for got, expected in zip(*results, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    assert 0.05 < np.mean(np.asarray(results[0][0]) != 0) < 1
 
 
 @pytest.mark.parametrize("mode", ["bilinear", "bicubic"])

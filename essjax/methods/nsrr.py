@@ -1,0 +1,88 @@
+"""NSRR (Xiao et al. 2020; thesis 002 sections 3.2, 4.5): supersampling from the current and four previous frames.
+
+Every frame is rendered. Previous frames are zero-upsampled and warped to the current one along their composed motion,
+each by a single bilinear read; there is no recurrence of the output. Colour is display-referred inside.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from essjax.cameras import pixel_positions
+from essjax.color import display, display_inverse
+from essjax.frames import Frame, Prediction, depth_scale, network_depth, rendered_color
+from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
+from essjax.methods.baselines import jau_image
+from essjax.methods.rendered import Memory, advance, push, reset_memory, start_memory
+from essjax.networks.nsrr import FEATURES, PREVIOUS, RGBD
+from essjax.networks.nsrr import nsrr as nsrr_network
+from essjax.typing import Array, Image, pytree
+from essjax.warp import sample_zero_upsampled, upsample_motion, zero_upsample
+
+
+@pytree
+class History:
+    """The frames to look back at.
+
+    Attributes:
+      rendered: the four latest frames; their content are features ``[4, ..., H, W, FEATURES]``, low resolution.
+      depth_scale: unit of depth, ``[...]``: that of the first frame since the cut.
+    """
+
+    rendered: Memory
+    depth_scale: Array
+
+
+def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
+    """The previous frames' features at the output pixels of ``frame``, ``[4, ..., sH, sW, FEATURES]``.
+
+    What zero-upsampling each and warping it by its motion (composed at low resolution, upsampled bilinearly) gives; 0
+    where a path leads outside and where no sample of that frame fell next to its end.
+    """
+    frames = rendered.frames
+    motion = jax.lax.stop_gradient(upsample_motion(frames.motion, scale, jitter=frame.jitter))
+    positions = pixel_positions(*motion.shape[-3:-1]) + motion
+    return sample_zero_upsampled(frames.content, positions, scale, frames.jitter)
+
+
+def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True) -> Method:
+    """Neural supersampling of a sequence that is rendered in every frame.
+
+    ``variables = {"nsrr": ...}``. ``aux``: ``display_image``, the output before it is clipped to [0, 1] (x / (1 + x),
+    then sRGB), and ``weights`` of the previous frames ``[..., sH, sW, 4]``.
+
+    Args:
+      scale: whole number.
+      width: of the network, 32 as published.
+      residual: add the jitter-aligned upsampled current frame to the network's output, which starts at zero: untrained
+        it is the baseline ``jau``. The paper's network returns the image itself.
+    """
+    network = nsrr_network(width)
+
+    def start(example: Frame) -> History:
+        content = jnp.zeros((*example.motion.shape[:-1], FEATURES), jnp.float32)
+        return History(rendered=start_memory(example, content, PREVIOUS), depth_scale=depth_scale(example.gbuffers))
+
+    def init(key, example):
+        *lead, height, wide, _ = example.motion.shape
+        high = (*lead, scale * height, scale * wide, FEATURES)
+        shapes = (*lead, height, wide, RGBD), high, (PREVIOUS, *high)
+        return {"nsrr": network.init(key, *(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes))}
+
+    def render_step(variables, history, frame, *, train=False):
+        color = rendered_color(frame, info.name)
+        fresh = start(frame)
+        rendered = reset_memory(frame.cut, fresh.rendered, history.rendered)
+        unit = reset_at_cut(frame.cut, fresh.depth_scale, history.depth_scale)
+        rendered = advance(rendered, frame)
+        rgbd = jnp.concatenate([display(color), network_depth(frame.gbuffers, unit)], axis=-1)
+        own, _ = network.apply(variables["nsrr"], rgbd, train=train, method="current")
+        own = zero_upsample(own, scale, frame.jitter)
+        warped = warp_previous(rendered, frame, scale)
+        (output, weights), _ = network.apply(variables["nsrr"], own, warped, train=train, method="reconstruct")
+        shown = output + display(jau_image(frame, scale)) if residual else output
+        remembered, _ = network.apply(variables["nsrr"], rgbd, train=train, method="previous")
+        history = History(rendered=push(rendered, frame, remembered), depth_scale=unit)
+        return history, Prediction(image=display_inverse(shown), aux={"display_image": shown, "weights": weights})
+
+    info = MethodInfo("nsrr", scale=scale, predicts=frozenset({"ss"}), renders_all=True)
+    return Method(init, start, render_step, refuse_extrapolation("nsrr"), info)
