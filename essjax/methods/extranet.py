@@ -24,6 +24,8 @@ from essjax.typing import Array, Color, Image, Mask, Plane, PyTree, pytree
 from essjax.warp import backward_warp, hole_mask, jittered_motion, occlusion_motion
 
 REQUIRES = frozenset({"base_color", "normal", "roughness", "metallic"})
+WINDOW = 2 * FRAMES
+"""Frames from the oldest one that a prediction looks back at to itself: t-5, t-3, t-1 are rendered."""
 
 
 @pytree

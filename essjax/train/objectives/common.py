@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from essjax.frames import Sequence, select_time
+from essjax.frames import Frame, Prediction, Sequence, select_time, without_color
 from essjax.interfaces import Method
 from essjax.rollout import ESS, SS, alternate, unroll
 from essjax.typing import Array, Callable, PyTree
@@ -52,3 +52,31 @@ def odd_length(clip: Sequence) -> Sequence:
     """``clip`` without its last frame if their number is even: what ``both_kinds`` takes."""
     length = clip.frames.motion.shape[0]
     return clip if length % 2 else select_time(clip, slice(0, length - 1))
+
+
+def predict_last(method: Method, variables: PyTree, frames: Frame) -> Prediction:
+    """Extrapolate the last frame of a clip (``train=True``) from the history that the alternation gives it.
+
+    For methods whose history holds rendered frames only. Predictions on the way there are not computed: nothing reads
+    them, and no scan keeps them alive.
+
+    Args:
+      method: extrapolates.
+      variables: its variables.
+      frames: ``[T, ...]``, T >= 2.
+
+    Raises:
+      ValueError: there are fewer than two frames.
+    """
+    length = frames.motion.shape[0]
+    if length < 2:
+        raise ValueError(f"clip: expected at least 2 frames, one to extrapolate from, got {length}.")
+    history = method.start(select_time(frames, 0))
+    kinds = alternate(length % 2).kinds(length)  # the last is extrapolated
+    for n, kind in enumerate(kinds[:-1]):
+        frame = select_time(frames, n)
+        if kind == SS:
+            history, _ = method.render_step(variables, history, frame)
+        else:
+            history, _ = method.extrapolate_step(variables, history, without_color(frame))
+    return method.extrapolate_step(variables, history, without_color(select_time(frames, length - 1)), train=True)[1]
