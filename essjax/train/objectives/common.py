@@ -57,8 +57,8 @@ def odd_length(clip: Sequence) -> Sequence:
 def predict_last(method: Method, variables: PyTree, frames: Frame) -> Prediction:
     """Extrapolate the last frame of a clip (``train=True``) from the history that the alternation gives it.
 
-    For methods whose history holds rendered frames only. Predictions on the way there are not computed: nothing reads
-    them, and no scan keeps them alive.
+    For methods whose history holds rendered frames only: no gradient flows through it. What is predicted on the way is
+    not computed, because nothing reads it.
 
     Args:
       method: extrapolates.
@@ -71,12 +71,18 @@ def predict_last(method: Method, variables: PyTree, frames: Frame) -> Prediction
     length = frames.motion.shape[0]
     if length < 2:
         raise ValueError(f"clip: expected at least 2 frames, one to extrapolate from, got {length}.")
+
+    def render(history: PyTree, frame: Frame) -> PyTree:
+        return method.render_step(variables, history, frame)[0]
+
+    def pair(history: PyTree, chunk: Frame) -> tuple[PyTree, None]:
+        history = render(history, select_time(chunk, 0))
+        return method.extrapolate_step(variables, history, without_color(select_time(chunk, 1)))[0], None
+
     history = method.start(select_time(frames, 0))
-    kinds = alternate(length % 2).kinds(length)  # the last is extrapolated
-    for n, kind in enumerate(kinds[:-1]):
-        frame = select_time(frames, n)
-        if kind == SS:
-            history, _ = method.render_step(variables, history, frame)
-        else:
-            history, _ = method.extrapolate_step(variables, history, without_color(frame))
-    return method.extrapolate_step(variables, history, without_color(select_time(frames, length - 1)), train=True)[1]
+    if length % 2:  # the alternation that ends with an extrapolated frame starts with a warm-up
+        history, frames = render(history, select_time(frames, 0)), select_time(frames, slice(1, length))
+    pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, 2, *leaf.shape[1:]), frames)
+    history, _ = jax.lax.scan(pair, history, select_time(pairs, slice(0, -1)))
+    history = render(history, select_time(frames, -2))
+    return method.extrapolate_step(variables, history, without_color(select_time(frames, -1)), train=True)[1]
