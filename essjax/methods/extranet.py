@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from essjax import networks
 from essjax.color import demodulate, expm1, log1p, modulate
-from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require
+from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require, surface_guides
 from essjax.interfaces import Method, MethodInfo, expand_flag
 from essjax.methods.rendered import Memory, advance, albedo, push, reset_memory, start_memory
 from essjax.networks.extranet import FRAMES, input_shapes
@@ -108,7 +108,7 @@ def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True) -> I
         around = occlusion_motion(motion[0], frame.gbuffers.depth, valid[0])
         warped.append(log1p(backward_warp(kept.shading[0], around)))
     # Nothing was hit: the published weights were trained with (-1, -1, -1) there.
-    normal = jnp.where(background(frame.gbuffers), -1.0, frame.gbuffers.normal)
+    normal = jnp.where(background(frame.gbuffers), -1.0, surface_guides(frame.gbuffers)[1])
     features = [normal, relative_depth(frame.gbuffers), frame.gbuffers.roughness, frame.gbuffers.metallic]
     inputs = Inputs(
         warped=jnp.concatenate(warped, axis=-1),
