@@ -2,5 +2,6 @@
 
 from essjax.train.objectives.common import Objective, both_kinds, odd_length
 from essjax.train.objectives.extrass import extrass_objective, frnet_objective
+from essjax.train.objectives.fasset import fasset_objective
 
-__all__ = ["Objective", "both_kinds", "extrass_objective", "frnet_objective", "odd_length"]
+__all__ = ["Objective", "both_kinds", "extrass_objective", "fasset_objective", "frnet_objective", "odd_length"]
