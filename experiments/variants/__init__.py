@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, extranet, extrass
+from experiments.variants import baselines, extranet, extrass, fasset
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
     **extranet.VARIANTS,
+    **fasset.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""
