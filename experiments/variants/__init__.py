@@ -15,8 +15,9 @@ VARIANTS: dict[str, Variant] = {
 
 BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "taau-half", "taau", "taa")
 """Rows of every table."""
+EVERY_FRAME = "gets every frame rendered: twice the input"
 REFERENCES = {
-    "taau": "gets every frame rendered: twice the input",
+    **dict.fromkeys(("taau", "tus", *dlctus.VARIANTS), EVERY_FRAME),
     "taa": "gets every frame rendered at native resolution: eight times the input",
 }
 """Rows that are not on equal terms, and why."""

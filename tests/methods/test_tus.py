@@ -13,7 +13,7 @@ from essjax.frames import Frame, GBuffers
 from essjax.methods.taau import UPSAMPLED_WEIGHT, clip_to_box
 from essjax.rollout import every, unroll
 from essjax.scenes.jitter import jitter_sequence
-from essjax.warp import jitter_aligned_upsample
+from essjax.warp import gaussian_resample, jitter_aligned_upsample
 from tests.helpers import make_frames
 
 H, W = 4, 5
@@ -61,18 +61,14 @@ def accumulated(scale, rate_of):
     return frames, image
 
 
-def test_tus_at_4x4_collects_every_sample_once():
+def test_tent_with_alpha_1_at_4x4_collects_every_sample_once():
     frames, expected = accumulated(4, lambda seen: 1.0)
-    np.testing.assert_allclose(run(methods.tus(4, clamp="none"), frames)[-1], expected, atol=1e-4)
+    got = run(methods.taau(4, alpha=1.0, accumulation="constant", **ENDLESS), frames)[-1]
+    np.testing.assert_allclose(got, expected, atol=1e-4)
     x, y = np.meshgrid((np.arange(4 * W) + 0.5) / 4, (np.arange(4 * H) + 0.5) / 4)
     away = np.ones((4 * H, 4 * W), bool)
     away[::4, ::4] = False  # frame 0's samples were shown as their own JAU
     np.testing.assert_allclose(expected[away], painted(x, y)[away], atol=1e-5)
-
-
-def test_tus_at_2x2_halves():
-    frames, expected = accumulated(2, lambda seen: 0.5)
-    np.testing.assert_allclose(run(methods.tus(2, clamp="none"), frames)[-1], expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("accumulation", ["average", "bounded"])
@@ -140,6 +136,18 @@ def test_clipped_history_lies_in_the_box_of_its_space(clamp):
     assert float(jnp.abs(clipped - clamped).max()) > 0.005
     # The clamp ends on a corner of the box wherever history is brighter in every channel; the clip does not.
     assert np.mean(np.abs(encode(clamped) - high) < 1e-3) > np.mean(np.abs(encode(clipped) - high) < 1e-3)
+
+
+def test_tus_is_equation_39_with_a_constant_alpha():
+    frames = dataclasses.replace(still(2, 3)[1], cut=jnp.arange(3) == 0)
+    plain = {"clamp": "rgb", "dilate": False, "history_mode": "bicubic-0.75", "accumulation": "constant"}
+    image = run(methods.tus(2), frames)
+    np.testing.assert_allclose(image, run(methods.taau(2, alpha=0.5, sigma=0.65, **plain), frames), atol=1e-5)
+    color, previous = reinhard(frames.color[1]), image[0]
+    current = gaussian_resample(color, color, frames.jitter[1], jnp.float32(0.65), 2)
+    rate = 0.5 * current.weight
+    expected = rate * current.color + (1 - rate) * jnp.clip(previous, current.low, current.high)
+    np.testing.assert_allclose(image[1], expected, atol=1e-4)
 
 
 def test_info_and_errors():
