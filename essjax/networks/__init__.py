@@ -2,7 +2,8 @@
 
 from essjax.networks.dlctus import dlctus_network
 from essjax.networks.extrassnet import extrassnet
+from essjax.networks.fasset import fasset
 from essjax.networks.frnet import frnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = ["dlctus_network", "extrassnet", "frnet", "nsrr"]
+__all__ = ["dlctus_network", "extrassnet", "fasset", "frnet", "nsrr"]

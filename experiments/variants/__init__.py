@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, dlctus, extrass
+from experiments.variants import baselines, dlctus, extrass, fasset
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
+    **fasset.VARIANTS,
     **dlctus.VARIANTS,
     **baselines.VARIANTS,
 }
