@@ -5,6 +5,7 @@ from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, train
 from essjax.train.objectives import (
     Objective,
     both_kinds,
+    dlctus_objective,
     extranet_objective,
     extrass_objective,
     fasset_objective,
@@ -17,6 +18,7 @@ from essjax.train.step import make_train_step
 
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds", "constant",
-    "cosine", "create_state", "extranet_objective", "extrass_objective", "fasset_objective", "frnet_objective",
-    "halving", "learning_rate", "make_train_step", "odd_length", "optimizer", "predict_last", "train",
+    "cosine", "create_state", "dlctus_objective", "extranet_objective", "extrass_objective", "fasset_objective",
+    "frnet_objective", "halving", "learning_rate", "make_train_step", "odd_length", "optimizer", "predict_last",
+    "train",
 ]  # fmt: skip
