@@ -7,11 +7,12 @@ from essjax.methods.extranet import extranet
 from essjax.methods.extranet import from_torch as extranet_from_torch
 from essjax.methods.extrass import extrass, extrass_e, extrass_w
 from essjax.methods.fasset import fasset
+from essjax.methods.fasset_baselines import extranet_nsrr, extranet_plus, nsrr_extranet
 from essjax.methods.nsrr import nsrr
 from essjax.methods.taau import taa, taau, taau_half, tus
 
 __all__ = [
-    "bicubic", "bilinear", "composed", "dlctus", "extranet", "extranet_from_torch", "extranet_taa", "extrass",
-    "extrass_e", "extrass_w", "fasset", "gaussian_blur", "jau", "jau_image", "nsrr", "settled", "taa", "taau",
-    "taau_half", "tus", "warp",
+    "bicubic", "bilinear", "composed", "dlctus", "extranet", "extranet_from_torch", "extranet_nsrr", "extranet_plus",
+    "extranet_taa", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur", "jau", "jau_image", "nsrr",
+    "nsrr_extranet", "settled", "taa", "taau", "taau_half", "tus", "warp",
 ]  # fmt: skip

@@ -2,19 +2,18 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 
-from essjax import networks
-from essjax.color import demodulate, expm1, log1p, modulate
-from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require
+from essjax.color import demodulate, expm1, modulate
+from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods.baselines import jau_image
 from essjax.methods.composed import composed
 from essjax.methods.extranet import REQUIRES, Inputs, Kept, extranet, hole_buffers, network_inputs
 from essjax.methods.nsrr import nsrr
 from essjax.methods.rendered import Memory, advance, albedo, push, reset_memory, start_memory
-from essjax.networks.extranet import input_shapes
+from essjax.networks.extranet import FRAMES, input_shapes
+from essjax.networks.extranet import extranet as extranet_network
 from essjax.typing import Color, Image
 from essjax.warp import jitter_aligned_upsample, upsample_motion, zero_upsample
 
@@ -80,6 +79,22 @@ def nsrr_extranet(scale: int = 2, *, width: int = 32) -> Method:
     return composed("nsrr+extranet", first, extranet(), extrapolates=True, between=between)
 
 
+def _without_gaps(seen: Inputs) -> Inputs:
+    """Inputs whose shading has a fourth channel, 1 where a sample was read: no sample is a hole."""
+
+    def found(warped: Image) -> Image:
+        return (warped[..., 3:4] > 0).astype(jnp.float32)
+
+    plain, around = jnp.split(seen.warped, 2, axis=-1)
+    history = jnp.concatenate([seen.history[..., :3], seen.history[..., 4:] * found(seen.history)], axis=-1)
+    return Inputs(
+        warped=jnp.concatenate([plain[..., :3], around[..., :3]], axis=-1),
+        mask=seen.mask * found(plain),
+        features=seen.features,
+        history=history,
+    )
+
+
 def extranet_plus(scale: int = 2) -> Method:
     """ExtraNet+: ExtraNet at output size on zero-upsampled frames; it fills what was disoccluded and what lies between.
 
@@ -92,7 +107,7 @@ def extranet_plus(scale: int = 2) -> Method:
     Args:
       scale: whole number.
     """
-    network = networks.extranet()
+    network = extranet_network()
 
     def samples(shading: Color, frame: Frame) -> Image:
         """Shading and 1 where there is a sample, ``[..., sH, sW, 4]``."""
@@ -102,7 +117,7 @@ def extranet_plus(scale: int = 2) -> Method:
     def start(example: Frame) -> Memory:
         large = enlarge(example, scale, None)
         black = jnp.zeros((*large.motion.shape[:-1], 4))
-        return start_memory(large, Kept(shading=black, gbuffers=hole_buffers(large.gbuffers)), networks.FRAMES)
+        return start_memory(large, Kept(shading=black, gbuffers=hole_buffers(large.gbuffers)), FRAMES)
 
     def init(key, example):
         require(example, sorted(REQUIRES), info.name)
