@@ -3,19 +3,24 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, extrass
+from experiments.variants import baselines, dlctus, extranet, extrass, fasset
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
+    **extranet.VARIANTS,
+    **fasset.VARIANTS,
+    **dlctus.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""
 
 BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "taau-half", "taau", "taa")
 """Rows of every table."""
+EVERY_FRAME = "gets every frame rendered: twice the input"
 REFERENCES = {
-    "taau": "gets every frame rendered: twice the input",
+    **dict.fromkeys(("taau", "tus", *dlctus.VARIANTS), EVERY_FRAME),
+    "extranet+taa": "works at native resolution: four times the input",
     "taa": "gets every frame rendered at native resolution: eight times the input",
 }
 """Rows that are not on equal terms, and why."""
