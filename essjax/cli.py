@@ -81,6 +81,7 @@ def scenes(
     native: bool = False,
     seed: int = 0,
     mip_bias: float = 0.0,
+    jitter: Literal["halton", "dlctus"] = "halton",
 ) -> None:
     """Render built-in scenes into a dataset. Interrupted, the same command resumes; other splits can be added.
 
@@ -96,12 +97,14 @@ def scenes(
       native: Also 1-sample frames at the reference's size, the input of native TAA.
       seed: Skip this many seeds of the split.
       mip_bias: Texture filter, log2 of its width over an output pixel's.
+      jitter: Pattern of the sample positions: halton serves half the frames as well as all, dlctus only all of them.
     """
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None
     clips = plan(split, sequences, frames, spp=spp, families=chosen, start=seed)
     with progress_bar("rendering") as progress:
-        dataset = generate(out, clips, width, height, scale=scale, native=native, mip_bias=mip_bias, progress=progress)
+        settings = {"scale": scale, "native": native, "mip_bias": mip_bias, "jitter": jitter}
+        dataset = generate(out, clips, width, height, progress=progress, **settings)
     _print_dataset(dataset)
 
 

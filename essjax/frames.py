@@ -106,7 +106,8 @@ class Prediction:
     Attributes:
       image: ``[..., round(scale * H), round(scale * W), 3]`` linear HDR.
       aux: named intermediates (flow, masks, features) for losses and pictures.
-      state: new BatchNorm statistics when ``train``, else {}.
+      state: new BatchNorm statistics when ``train``, else {}; keyed as the variables are:
+        ``{entry: {"batch_stats": ...}}``.
     """
 
     image: Color

@@ -10,6 +10,8 @@ import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
 from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
 
+UNSAID = {"jitter": "halton"}
+"""Settings that a dataset names only if they differ from these: it may be older than the choice."""
 Progress = Callable[[int, int], Any]
 """Called with (frames done, frames in all)."""
 
@@ -76,8 +78,8 @@ def _check_request(out: Path, clips: Sequence[Clip], settings: dict) -> dict[str
     if not (out / "dataset.json").is_file():
         return {}
     dataset = read_dataset(out)
-    for key, asked in settings.items():
-        found = dataset.source.get(key)
+    for key, asked in {**UNSAID, **settings}.items():
+        found = dataset.source.get(key, UNSAID.get(key))
         if found != asked:
             raise ValueError(
                 f"{out}: this dataset was made with {key} = {found!r}, asked for {asked!r}. "
@@ -104,6 +106,7 @@ def generate(
     scale: int = 2,
     native: bool = False,
     mip_bias: float = 0.0,
+    jitter: str = "halton",
     progress: Progress = lambda done, total: None,
 ) -> Dataset:
     """Render clips into a dataset, frame by frame and atomically; running it again resumes.
@@ -119,6 +122,7 @@ def generate(
       scale: reference size over frame size.
       native: also frames at the reference's size (the input of native TAA).
       mip_bias: texture filter, see ``scenes.render_frame``.
+      jitter: pattern, "halton" or "dlctus", see ``scenes.jitter_sequence``.
       progress: called after each frame.
 
     Raises:
@@ -127,6 +131,7 @@ def generate(
     out, clips = Path(out), list(clips)
     shared = {"renderer": "essjax.scenes", "width": width, "height": height, "scale": scale, "native": native}
     shared["mip_bias"] = float(mip_bias)
+    shared |= {"jitter": jitter} if jitter != UNSAID["jitter"] else {}
     splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
     for clip in clips:
@@ -135,8 +140,9 @@ def generate(
         for index in range(clip.frames):
             if index not in writer:
                 frame = render_frame(
-                    scene, index, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias
-                )
+                    scene, index, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias,
+                    jitter=jitter,
+                )  # fmt: skip
                 writer.write(
                     index, frame.frames, frame.reference, valid=frame.valid, steady=frame.steady, native=frame.native
                 )
@@ -156,6 +162,7 @@ def live_source(
     scale: int = 2,
     native: bool = False,
     mip_bias: float = 0.0,
+    jitter: str = "halton",
     on_frame: Callable[[int], Any] | None = None,
 ) -> CachedSource:
     """A source for ``data.clips`` that renders each clip when first asked for it, without touching the disk.
@@ -167,13 +174,15 @@ def live_source(
       scale: see ``generate``.
       native: see ``generate``.
       mip_bias: see ``generate``.
+      jitter: see ``generate``.
       on_frame: called with the index of each finished frame of a clip.
     """
 
     def render(clip: Clip) -> essjax.frames.Sequence:
         scene = make_scene(clip.family, clip.seed, clip.frames)
         return render_sequence(
-            scene, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias, on_frame=on_frame
-        )
+            scene, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias, jitter=jitter,
+            on_frame=on_frame,
+        )  # fmt: skip
 
     return CachedSource(functools.partial(render, clip) for clip in clips)

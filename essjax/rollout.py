@@ -50,11 +50,13 @@ class Rollout:
       image: ``[T, ..., h, w, 3]``, frame n's image at index n whatever the method's latency.
       aux: kind -> pytree of the frames of that kind, in order: what ``keep`` kept.
       history: the history after the last frame.
+      state: entry of the variables -> its new BatchNorm statistics, the mean over the steps that returned any.
     """
 
     image: Array
     aux: dict[str, PyTree]
     history: PyTree
+    state: dict[str, PyTree]
 
 
 def check_supported(method: Method, frames: Frame, schedule: Schedule) -> None:
@@ -108,7 +110,7 @@ def unroll(
             return _step(method, variables, history, frame, kind, train)
 
         history, prediction = (jax.checkpoint(step) if remat else step)(variables, history, frame)
-        return history, (prediction.image, keep(prediction.aux))
+        return history, (prediction.image, keep(prediction.aux), prediction.state)
 
     outputs: list[tuple[int, tuple]] = []  # (frame, output); scanned ones are added below
     for n in range(min(schedule.lead, length)):
@@ -145,16 +147,24 @@ def _stack(trees: list[PyTree]) -> PyTree:
 
 
 def _collect(method: Method, outputs: list, kinds: tuple[str, ...], history: PyTree) -> Rollout:
-    images = jnp.stack([image for _, (image, _) in outputs])
+    images = jnp.stack([image for _, (image, _, _) in outputs])
     if method.info.latency:  # step n shows frame n - latency; the last frames repeat the last image
         shift = method.info.latency
         images = jnp.concatenate([images[shift:], jnp.repeat(images[-1:], shift, axis=0)])
     aux = {}
     for kind in (SS, ESS):
-        chosen = [kept for n, (_, kept) in outputs if kinds[n] == kind]
+        chosen = [kept for n, (_, kept, _) in outputs if kinds[n] == kind]
         if chosen:
             aux[kind] = _stack(chosen)
-    return Rollout(image=images, aux=aux, history=history)
+    states = [state for _, (_, _, state) in outputs]
+    return Rollout(image=images, aux=aux, history=history, state=_mean_state(states))
+
+
+def _mean_state(states: list[dict[str, PyTree]]) -> dict[str, PyTree]:
+    """Statistics by entry: each step started from the same old ones, so their mean has seen every step alike."""
+    names = dict.fromkeys(name for state in states for name in state)
+    found = {name: [state[name] for state in states if name in state] for name in names}
+    return {name: jax.tree.map(lambda *leaves: sum(leaves) / len(leaves), *trees) for name, trees in found.items()}
 
 
 def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:

@@ -1,43 +1,68 @@
 """The rows of a run's table: which methods, with which variables, and what to tell the reader about them."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 
 from essjax.data import Dataset
-from essjax.frames import Sequence, frame_images, select_time
+from essjax.frames import Sequence as FrameSequence
+from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method
 from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.evaluate import Clip, Runner
 from experiments.tuning import Setting, setting_variables, tune
-from experiments.variants import BASELINES, PARTS, REFERENCES, VARIANTS, compared
+from experiments.variants import BASELINES, REFERENCES, VARIANTS, compared, stages_of, trained_as
+
+
+class Trained(NamedTuple):
+    """What training a variant gave.
+
+    Attributes:
+      variables: entry -> linen variables.
+      config: the settings that it was trained with.
+      report: stage -> ``{"steps", "seconds", "terms"}``.
+    """
+
+    variables: PyTree
+    config: Config
+    report: dict[str, Any]
 
 
 def make_runners(
-    name: str,
+    names: Sequence[str],
     config: Config,
-    variables: PyTree,
+    trained: Mapping[str, Trained],
     validation: list[Clip],
     out: Path,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict[str, Runner], dict[str, Setting]]:
-    """Runners of the variant ``name`` and of what it is compared with; the TAA family is tuned on ``validation``.
+    """Runners of the variants ``names`` and of what they are compared with; the TAA family is tuned on ``validation``.
 
     The chosen settings are kept in ``out / "tuning.json"``: a resumed run does not search again.
+
+    Args:
+      names: variants that must have a row.
+      config: the settings of methods that are not trained.
+      trained: variant -> what its training gave; of those that ``names`` and their parts take their weights from.
+      validation: for tuning.
+      out: folder of the run.
+      on_step: called with what is being tuned.
     """
     native = validation[0].sequence.native is not None
     runners, settings = {}, {}
     kept = _read_settings(out / "tuning.json")
     frames = select_time(validation[0].sequence.frames, 0)
-    for row in compared(name):
-        variant = VARIANTS[row]
-        if row == "taa" and not native:
+    for row in compared(names):
+        variant, owner = VARIANTS[row], _owner(row, names, trained)
+        own_config = trained[owner].config if owner else config
+        method = variant.method(own_config)
+        if method.info.native and not native:
             continue
-        method = variant.method(config)
-        if row != name and unfit(method, validation[0].sequence):
+        if row not in names and unfit(method, validation[0].sequence):
             continue
         if variant.tuned and config.tune:
             if row not in kept:
@@ -46,19 +71,26 @@ def make_runners(
             settings[row] = kept[row]
             method = variant.method(config, clamp=kept[row].clamp)
             runners[row] = Runner(method, setting_variables(kept[row]), config.compiler_options)
-        elif variant.tuned:
-            runners[row] = Runner(method, method.init(jax.random.key(0), frames), config.compiler_options)
-        elif row in (name, *PARTS.get(name, ())):
-            entries = [stage.name for stage in variant.stages(config)]
-            runners[row] = Runner(method, {entry: variables[entry] for entry in entries}, config.compiler_options)
+        elif owner:
+            entries = [stage.name for stage in stages_of(row, own_config)]
+            variables = {entry: trained[owner].variables[entry] for entry in entries}
+            runners[row] = Runner(method, variables, own_config.compiler_options)
         else:
-            runners[row] = Runner(method, {}, config.compiler_options)
+            runners[row] = Runner(method, method.init(jax.random.key(0), frames), config.compiler_options)
     content = {row: setting._asdict() for row, setting in settings.items()}
     (out / "tuning.json").write_text(json.dumps(content, indent=1) + "\n")
     return runners, settings
 
 
-def unfit(method: Method, sequence: Sequence) -> str:
+def _owner(row: str, names: Sequence[str], trained: Mapping[str, Trained]) -> str | None:
+    """The trained variant whose variables ``row`` runs with; None for a heuristic."""
+    if trained_as(row) in trained:
+        return trained_as(row)
+    whole = (trained_as(name) for name in names if row in VARIANTS[name].parts)
+    return next((name for name in whole if name in trained), None)
+
+
+def unfit(method: Method, sequence: FrameSequence) -> str:
     """Why ``method`` cannot be run and scored on ``sequence``, or an empty string."""
     missing = sorted(method.info.requires - set(frame_images(sequence.frames)))
     if missing:
@@ -79,7 +111,7 @@ def table_references() -> dict[str, str]:
     return dict(REFERENCES)
 
 
-def _left_out(sequence: Sequence, config: Config) -> list[str]:
+def _left_out(sequence: FrameSequence, config: Config) -> list[str]:
     """One remark per baseline that does not fit the data."""
     reasons = {row: unfit(VARIANTS[row].method(config), sequence) for row in BASELINES}
     return [f"No {row} row: {reason}." for row, reason in reasons.items() if reason]

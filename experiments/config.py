@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -12,9 +13,9 @@ class Config:
     Data that the renderer makes (ignored with ``--data``, but for ``clip`` and ``crop``):
       seed, size (width, height), scale, train_sequences / validation_sequences / test_sequences (per family),
       train_frames (also of validation), test_frames, train_spp (also of validation), test_spp, mip_bias.
-    Training: clip (frames per BPTT window), crop (width, height), frnet_batch, batch, width, frnet_width,
-      frnet_learning_rate, learning_rate, the stages' budgets *_steps and *_seconds, save_every,
-      the losses' weights of ExtraSS eq 9, 12, 14, vgg (path of VGG-16 weights).
+    Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
+      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). save_every, the
+      losses' weights of ExtraSS eq 9, 12, 14, vgg (path of VGG-16 weights).
     Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
       scored at the start and after a cut), pictures (chosen frames per sequence).
     optimize: false compiles in half the time for slower code.
@@ -33,14 +34,14 @@ class Config:
     mip_bias: float = 0.0
     clip: int = 7
     crop: tuple[int, int] = (48, 48)
-    frnet_batch: int = 4
+    first_batch: int = 4
     batch: int = 4
+    first_width: int = 16
     width: int = 16
-    frnet_width: int = 16
-    frnet_learning_rate: float = 1e-3
+    first_learning_rate: float = 1e-3
     learning_rate: float = 3e-3
-    frnet_steps: int | None = None
-    frnet_seconds: float | None = 45.0
+    first_steps: int | None = None
+    first_seconds: float | None = 45.0
     steps: int | None = None
     seconds: float | None = 245.0
     save_every: float = 30.0
@@ -63,15 +64,15 @@ class Config:
 PRESETS: dict[str, Config] = {
     "smoke": Config(
         size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=3, crop=(32, 24),
-        batch=2, frnet_batch=2, width=8, frnet_width=8, frnet_steps=4, steps=6, frnet_seconds=None, seconds=None,
+        batch=2, first_batch=2, width=8, first_width=8, first_steps=4, steps=6, first_seconds=None, seconds=None,
         tune=False, optimize=False,
     ),
     "quick": Config(),
     "paper": Config(
         size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
-        train_spp=64, clip=9, crop=(128, 128), batch=12, frnet_batch=8, width=24, frnet_width=24,
-        frnet_learning_rate=1e-4, learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0,
-        frnet_steps=100 * 900, steps=120 * 600, frnet_seconds=None, seconds=None, save_every=300.0, pictures=2,
+        train_spp=64, clip=9, crop=(128, 128), batch=12, first_batch=8, width=24, first_width=24,
+        first_learning_rate=1e-4, learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0,
+        first_steps=100 * 900, steps=120 * 600, first_seconds=None, seconds=None, save_every=300.0, pictures=2,
     ),
 }  # fmt: skip
 """smoke: every part runs once, under a minute on two cores. quick: the default, seven minutes. paper: the
@@ -80,15 +81,20 @@ papers' settings (an epoch: one crop from each of 120 sequences' 60 frames, 900 
 PRESET_NAMES = tuple(PRESETS)
 
 
-def make_config(preset: str, overrides: list[str]) -> Config:
+def make_config(preset: str, overrides: list[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> Config:
     """The preset with ``key=value`` overrides; values are JSON (``size=[128,72]``, ``steps=null``) or plain words.
+
+    Args:
+      preset: its name.
+      overrides: of the command line.
+      settings: preset -> what a variant changes in it (``Variant.presets``); ``overrides`` come on top.
 
     Raises:
       ValueError: unknown preset or key (the valid ones are listed), or a value of the wrong type.
     """
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}.")
-    config = PRESETS[preset]
+    config = dataclasses.replace(PRESETS[preset], **(settings or {}).get(preset, {}))
     valid = {field.name: field for field in dataclasses.fields(Config)}
     for override in overrides:
         key, separator, text = override.partition("=")
@@ -127,7 +133,7 @@ def _parse(key: str, text: str, kind: Any) -> Any:
 
 
 def _check(config: Config) -> None:
-    for name in ("frnet", ""):
+    for name in ("first", ""):
         steps, seconds = f"{name}_steps".lstrip("_"), f"{name}_seconds".lstrip("_")
         if getattr(config, steps) is None and getattr(config, seconds) is None:
             raise ValueError(f"--set: {steps} and {seconds} are both null; give one of them.")

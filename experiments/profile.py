@@ -11,7 +11,7 @@ from essjax.rollout import ESS, SS, stream_step
 from essjax.train import create_state, make_train_step, optimizer
 from experiments.config import Config
 from experiments.training import initial_variables, make_batches
-from experiments.variants import get_variant
+from experiments.variants import get_variant, stages_of
 
 
 def write_profile(name: str, config: Config, out: Path, console: Console, *, repetitions: int = 5) -> int:
@@ -20,7 +20,7 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
     clips = plan("train", 1, max(config.clip, 3), spp=1, families=["carousel"])
     dataset = generate(out / "profile-scenes", clips, *config.size, scale=config.scale)
     folder = out / "profile"
-    stages = variant.stages(config)
+    stages = stages_of(name, config)
     if stages:
         stage = stages[-1]
         variables = initial_variables(stages, dataset, config)

@@ -1,5 +1,6 @@
 """Train a variant: its stages in order, each resumable from its newest checkpoint."""
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +12,10 @@ import numpy as np
 from essjax.data import clips, disk_source
 from essjax.data.layout import Dataset
 from essjax.frames import select_time
-from essjax.train import Checkpoints, cosine, create_state, make_train_step, optimizer, train
+from essjax.train import Checkpoints, create_state, learning_rate, make_train_step, optimizer, train
 from essjax.typing import PyTree
 from experiments.config import Config
-from experiments.variants import Stage, Variant
+from experiments.variants.base import Stage
 
 MIN_CROP = 24
 OnStep = Callable[[str, int, float, dict[str, float]], None]
@@ -22,7 +23,7 @@ OnStep = Callable[[str, int, float, dict[str, float]], None]
 
 
 def make_batches(dataset: Dataset, config: Config, stage: Stage):
-    """A grain iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, an odd number of frames.
+    """A grain iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
 
     Raises:
       ValueError: no sequence is long enough for a clip, or the crop is too small.
@@ -36,7 +37,6 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
         )
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
     length = min(config.clip, longest)
-    length -= 1 - length % 2  # SS/ESS pairs from frames 0 and 1 need an odd number
     source = disk_source(dataset, "train")
     return iter(clips(source, length=length, batch=stage.batch, crop=(height, width), seed=config.seed))
 
@@ -48,15 +48,14 @@ def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> 
     return stages[-1].method.init(jax.random.key(config.seed), example)
 
 
-def train_variant(
-    variant: Variant, dataset: Dataset, config: Config, out: Path, on_step: OnStep
+def train_stages(
+    stages: list[Stage], dataset: Dataset, config: Config, out: Path, on_step: OnStep
 ) -> tuple[PyTree, dict[str, Any]]:
-    """Train all stages; a stage with a checkpoint at the end of its budget is only restored.
+    """Train all stages in order; one with a checkpoint at the end of its budget is only restored.
 
     Returns:
       The variables, and stage -> ``{"steps", "seconds", "terms"}``.
     """
-    stages = variant.stages(config)
     variables, report = initial_variables(stages, dataset, config), {}
     for stage in stages:
         transform = optimizer()
@@ -72,7 +71,7 @@ def train_variant(
                 checkpoints,
                 out / "train" / f"{stage.name}.jsonl",
                 stage.budget,
-                lambda step, progress, peak=stage.learning_rate: cosine(step, progress, peak=peak),
+                functools.partial(learning_rate, peak=stage.learning_rate, decay=stage.decay),
                 save_every=config.save_every,
                 on_step=lambda step, progress, terms, name=stage.name: on_step(name, step, progress, terms),
             )
@@ -82,13 +81,12 @@ def train_variant(
     return variables, report
 
 
-def restore_variant(variant: Variant, dataset: Dataset, config: Config, out: Path) -> tuple[PyTree, dict[str, Any]]:
+def restore_stages(stages: list[Stage], dataset: Dataset, config: Config, out: Path) -> tuple[PyTree, dict[str, Any]]:
     """The variables of the newest checkpoint of the last stage, for ``--eval-only``.
 
     Raises:
       ValueError: there is none, or it does not fit the settings.
     """
-    stages = variant.stages(config)
     last = stages[-1]
     variables = initial_variables(stages, dataset, config)
     folder = out / "checkpoints" / last.name

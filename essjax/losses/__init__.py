@@ -9,10 +9,10 @@ from essjax.losses.holes import hardest, masked_mean, occlusion
 from essjax.losses.perceptual import perceptual
 from essjax.losses.pixel import charbonnier, l1
 from essjax.losses.ssim import ssim_map
-from essjax.losses.temporal import feature_l1, sum_of_means, temporal_l1
+from essjax.losses.temporal import feature_l1, spatio_temporal, sum_of_means, temporal_l1
 from essjax.losses.vgg import vgg16_features
 
 __all__ = [
     "census", "charbonnier", "feature_census", "feature_l1", "hardest", "l1", "masked_mean", "occlusion",
-    "perceptual", "ssim_map", "sum_of_means", "temporal_l1", "vgg16_features",
+    "perceptual", "spatio_temporal", "ssim_map", "sum_of_means", "temporal_l1", "vgg16_features",
 ]  # fmt: skip

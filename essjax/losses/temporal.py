@@ -26,6 +26,25 @@ def temporal_l1(image: Color, warped_previous: Color, valid: Mask) -> Color:
     return jnp.where(valid > 0, valid * jnp.abs(image - warped_previous), 0.0)
 
 
+def spatio_temporal(error: Image, error_previous: Image, *, theta: float) -> Image:
+    """``|x| + |y| + theta (|x - y| - |x| - |y|)``, ``[..., H, W, C]``: the summand of DLCTUS' loss (thesis 002 eq 54).
+
+    The mean is eq 55. With ``theta`` 0 it is the L1 of two frames, with 1 it only asks that the error stays the same.
+
+    Args:
+      error: x, prediction minus target.
+      error_previous: y, the same of the previous frame, warped to this one.
+      theta: share of the temporal term, in [0, 1].
+
+    Raises:
+      ValueError: the shapes differ, or ``theta`` is outside [0, 1].
+    """
+    check_same_shape(error, error_previous, ("error", "error_previous"))
+    if not 0.0 <= theta <= 1.0:
+        raise ValueError(f"theta: expected a share in [0, 1], got {theta}.")
+    return (1.0 - theta) * (jnp.abs(error) + jnp.abs(error_previous)) + theta * jnp.abs(error - error_previous)
+
+
 def feature_l1(features_a: Sequence[Image], features_b: Sequence[Image]) -> list[Image]:
     """Absolute differences level by level: l_1 of ExtraSS eq 13, between both encoders' features of one frame.
 

@@ -8,9 +8,9 @@ from essjax.losses import ssim_map
 from essjax.metrics.psnr import MAX_PSNR, psnr
 from essjax.metrics.score import METRICS, MIN_HOLE_PIXELS, aggregate, score_rollout
 from essjax.metrics.ssim import ssim
-from essjax.metrics.temporal import flicker, tpsnr, warped_error
+from essjax.metrics.temporal import flicker, spatio_temporal_error, tpsnr, warped_error
 
 __all__ = [
-    "MAX_PSNR", "METRICS", "MIN_HOLE_PIXELS", "aggregate", "flicker", "psnr", "score_rollout", "ssim", "ssim_map",
-    "tpsnr", "warped_error",
+    "MAX_PSNR", "METRICS", "MIN_HOLE_PIXELS", "aggregate", "flicker", "psnr", "score_rollout",
+    "spatio_temporal_error", "ssim", "ssim_map", "tpsnr", "warped_error",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from essjax.losses import masked_mean
+from essjax.losses import masked_mean, spatio_temporal
 from essjax.losses.pixel import check_same_shape
 from essjax.metrics.psnr import PIXEL_AXES, psnr
 from essjax.typing import Image, Mask, Motion, Scalar
@@ -35,6 +35,36 @@ def tpsnr(prediction: Image, prediction_previous: Image, target: Image, target_p
     """
     difference = flicker(prediction, prediction_previous, target, target_previous)
     return psnr(difference, jnp.zeros_like(difference))
+
+
+def spatio_temporal_error(
+    prediction: Image,
+    prediction_previous: Image,
+    target: Image,
+    target_previous: Image,
+    motion: Motion,
+    *,
+    theta: float,
+) -> Scalar:
+    """Mean of ``losses.spatio_temporal`` of each image, ``[...]``: the columns of table 10 of thesis 002 (eq 55).
+
+    With ``theta`` 0 the spatial error (of two frames), with 1 the temporal one.
+
+    Args:
+      prediction: ``[..., H, W, C]`` display-referred, frame t.
+      prediction_previous: the same method's frame t-1.
+      target: the reference of frame t.
+      target_previous: the reference of frame t-1.
+      motion: ``[..., H, W, 2]`` pixels of this resolution.
+      theta: share of the temporal term, in [0, 1].
+
+    Raises:
+      ValueError: the shapes differ, or ``theta`` is outside [0, 1].
+    """
+    check_same_shape(prediction, target)
+    check_same_shape(prediction_previous, target_previous)
+    previous = backward_warp(prediction_previous - target_previous, motion)
+    return jnp.mean(spatio_temporal(prediction - target, previous, theta=theta), axis=PIXEL_AXES)
 
 
 def warped_error(image: Image, image_previous: Image, motion: Motion, *, valid: Mask | None = None) -> Scalar:

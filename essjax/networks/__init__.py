@@ -1,7 +1,8 @@
 """Flax modules behind ``Network(init, apply)``; the only package that imports flax."""
 
+from essjax.networks.dlctus import dlctus_network
 from essjax.networks.extrassnet import extrassnet
 from essjax.networks.frnet import frnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = ["extrassnet", "frnet", "nsrr"]
+__all__ = ["dlctus_network", "extrassnet", "frnet", "nsrr"]

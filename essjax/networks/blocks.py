@@ -126,6 +126,15 @@ class GatedConv(nn.Module):
         return nn.relu(batch_norm(train)(x)) if self.norm else x
 
 
+def replicated_conv(x: Image, features: int, size: int = 3, **options) -> Image:
+    """``conv`` with replicated borders; call it in a module's ``nn.compact`` method."""
+    radius = size // 2
+    pad = [(0, 0)] * (x.ndim - 3) + [(radius, radius), (radius, radius), (0, 0)]
+    # Cropped from the zero-padded convolution of the larger image: its gradient is the fast one.
+    wide = conv(features, size, **options)(jnp.pad(x, pad, mode="edge"))
+    return wide[..., radius:-radius, radius:-radius, :] if radius else wide
+
+
 class ConvBlock(nn.Module):
     """``layers`` 3x3 convolutions, each followed by a leaky ReLU.
 

@@ -13,20 +13,71 @@ def halton(index: int, base: int) -> float:
     return result
 
 
-def jitter_sequence(length: int, *, period: int = 16, every_frame: bool = False) -> np.ndarray:
-    """Jitter of each frame, pixels in [-0.5, 0.5): Halton (2, 3).
+PATTERNS = ("halton", "dlctus")
+"""Names of the jitter patterns: see ``jitter_sequence``."""
+HIGH_RESOLUTION_ORDER = (
+    (0, 0), (1, 2), (3, 2), (2, 0), (0, 1), (0, 3), (2, 2), (3, 0),
+    (1, 0), (0, 2), (2, 3), (3, 1), (1, 1), (1, 3), (3, 3), (2, 1),
+)  # fmt: skip
+"""(x, y) of the 4x4 output pixels in an input pixel, each once. No two consecutive ones touch, not even across the
+border of the input pixel or from the last to the first, and any four in a row lie in different quadrants."""
+HOURGLASS = ((0, 0), (1, 0), (0, 1), (1, 1))
+"""(x, y) of the 2x2 output pixels in an input pixel: along the top, the diagonal, along the bottom, the diagonal."""
 
-    Frame n takes element n // 2, so that even frames alone and odd frames alone cover the pixel (SPEC section 0):
-    plain Halton by n puts even and odd n into opposite halves. The two frames of a pair share a jitter.
+
+def dlctus_pattern(scale: int) -> np.ndarray:
+    """The 16 sample positions of DLCTUS (thesis 002 section 4.2.2, figure 6), pixels in [-0.5, 0.5).
+
+    At 4x4 every sample is the centre of an output pixel; at 2x2 the output pixels are visited in an hourglass, and
+    each takes elements 2 to 5 of Halton (2, 3) in turn. The figure's order at 4x4 is not in the text: ours has the
+    property that the text asks for, no two consecutive neighbours.
+
+    Args:
+      scale: 2 or 4.
+
+    Returns:
+      ``[16, 2]`` float32, (x, y).
+
+    Raises:
+      ValueError: another scale.
+    """
+    if scale == 4:
+        positions = (np.asarray(HIGH_RESOLUTION_ORDER) + 0.5) / 4
+    elif scale == 2:
+        inside = [(halton(element, 2), halton(element, 3)) for element in range(2, 6)]
+        positions = (np.asarray(inside)[:, None] + np.asarray(HOURGLASS)).reshape(16, 2) / 2
+    else:
+        raise ValueError(f"jitter: the pattern dlctus exists for the scales 2 and 4, got {scale}. Use halton.")
+    return (positions - 0.5).astype(np.float32)
+
+
+def jitter_sequence(
+    length: int, *, pattern: str = "halton", scale: int = 2, period: int = 16, every_frame: bool = False
+) -> np.ndarray:
+    """Jitter of each frame, pixels in [-0.5, 0.5).
+
+    "halton" is Halton (2, 3). Frame n takes element n // 2, so that even frames alone and odd frames alone cover the
+    pixel (SPEC section 0): plain Halton by n puts even and odd n into opposite halves. The two frames of a pair share a
+    jitter. "dlctus" is ``dlctus_pattern``, indexed by n: for methods that get every frame rendered. Half the frames
+    alone see half of it.
 
     Args:
       length: number of frames.
-      period: elements before the sequence repeats.
-      every_frame: index by n instead: for renderers that show colour of every frame (native TAA).
+      pattern: "halton" or "dlctus".
+      scale: output size over input size, for "dlctus".
+      period: elements before Halton repeats.
+      every_frame: index Halton by n instead: for renderers that show colour of every frame (native TAA).
 
     Returns:
       ``[length, 2]`` float32, (x, y).
+
+    Raises:
+      ValueError: an unknown pattern, or one that does not exist for this scale.
     """
+    if pattern not in PATTERNS:
+        raise ValueError(f"jitter: expected one of {', '.join(PATTERNS)}, got {pattern!r}.")
+    if pattern == "dlctus":
+        return dlctus_pattern(scale)[np.arange(length) % 16].reshape(length, 2)
     steps = range(length) if every_frame else [n // 2 for n in range(length)]
     points = [(halton(1 + k % period, 2) - 0.5, halton(1 + k % period, 3) - 0.5) for k in steps]
     return np.asarray(points, np.float32).reshape(length, 2)

@@ -48,7 +48,7 @@ def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray
 
 def render_frame(
     scene: Scene, index: int, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
-    mip_bias: float = 0.0,
+    mip_bias: float = 0.0, jitter: str = "halton",
 ) -> Sequence:  # fmt: skip
     """One frame of ``scene`` as a ``Sequence`` without time axis (leaves ``[H, W, C]``), NumPy arrays.
 
@@ -64,11 +64,15 @@ def render_frame(
       native: also render 1-sample frames at the reference's size; their jitter advances every frame.
       mip_bias: texture filter of LR and native frames, log2 of its width over an output pixel's: 0 is what
         upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
+        Eq 47 of thesis 002, -log2(f) - log2(spp) / 2 over an *input* pixel, is ``-log2(spp) / 2`` here: 0 for its
+        dataset 1 (1 sample per pixel), -1 for its dataset 2 (4 samples per pixel).
+      jitter: pattern of the LR frames, see ``jitter_sequence``; native frames always have Halton's.
 
     Raises:
-      ValueError: a size is not a positive whole number, or there is no frame ``index``.
+      ValueError: a size is not a positive whole number, there is no frame ``index``, or no such jitter pattern.
     """
     _check_size(width, height, scale, spp)
+    offset = jitter_sequence(index + 1, pattern=jitter, scale=scale)[index]
     world = scene.at(index)
     wide, high = width * scale, height * scale
     angle = pixel_angle(world, wide, mip_bias)
@@ -76,10 +80,10 @@ def render_frame(
     # Beside the buffers, so that the two compilations of the first frame run at the same time.
     with ThreadPoolExecutor(1) as beside:
         reference = beside.submit(render_reference, world, wide, high, spp=spp)
-        frame, valid, steady = _frame(scene, index, width, height, jitter_sequence(index + 1)[index], angle)
+        frame, valid, steady = _frame(scene, index, width, height, offset, angle)
         if native:
-            jitter = jitter_sequence(index + 1, every_frame=True)[index]
-            native_frame, _, _ = _frame(scene, index, wide, high, jitter, angle)
+            offset = jitter_sequence(index + 1, every_frame=True)[index]
+            native_frame, _, _ = _frame(scene, index, wide, high, offset, angle)
     return Sequence(frames=frame, reference=reference.result(), valid=valid, steady=steady, native=native_frame)
 
 
@@ -96,7 +100,7 @@ def iterate_frames(
 
 def render_sequence(
     scene: Scene, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
-    mip_bias: float = 0.0, on_frame: Callable[[int], None] | None = None,
+    mip_bias: float = 0.0, jitter: str = "halton", on_frame: Callable[[int], None] | None = None,
 ) -> Sequence:  # fmt: skip
     """All frames of ``scene``: a ``Sequence`` whose leaves are ``[T, H, W, C]`` float32 NumPy arrays.
 
@@ -108,10 +112,11 @@ def render_sequence(
       spp: see ``render_frame``.
       native: see ``render_frame``.
       mip_bias: see ``render_frame``.
+      jitter: see ``render_frame``.
       on_frame: called with the index of each finished frame (progress bars).
     """
-    parts = []
-    for index, part in iterate_frames(scene, width, height, scale=scale, spp=spp, native=native, mip_bias=mip_bias):
+    parts, settings = [], {"scale": scale, "spp": spp, "native": native, "mip_bias": mip_bias, "jitter": jitter}
+    for index, part in iterate_frames(scene, width, height, **settings):
         parts.append(part)
         if on_frame is not None:
             on_frame(index)

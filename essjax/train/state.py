@@ -6,7 +6,10 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from essjax.typing import Array, PyTree, pytree
+from essjax.typing import Array, Callable, PyTree, pytree
+
+STATISTICS = "batch_stats"
+"""Linen's collection of BatchNorm statistics."""
 
 
 @pytree
@@ -38,11 +41,42 @@ def create_state(variables: PyTree, trained: str, transform: optax.GradientTrans
     if trained not in variables:
         raise ValueError(f"trained: expected one of {', '.join(sorted(variables))}, got {trained!r}.")
     variables = jax.tree.map(jnp.array, variables)  # copies: the train step donates its state
-    return TrainState(variables=variables, optimizer=transform.init(variables[trained]), step=jnp.zeros((), jnp.int32))
+    weights, _ = split_statistics(variables[trained])
+    return TrainState(variables=variables, optimizer=transform.init(weights), step=jnp.zeros((), jnp.int32))
 
 
-def cosine(step: int, progress: float, *, peak: float, warmup_steps: int = 20, floor: float = 0.02) -> float:
-    """Learning rate: linear warm-up over the first steps, cosine decay from ``peak`` to ``floor * peak`` over progress.
+def split_statistics(entry: PyTree) -> tuple[PyTree, PyTree]:
+    """An entry of the variables as what gradients change and its BatchNorm statistics ({} if it has none)."""
+    weights = {name: part for name, part in entry.items() if name != STATISTICS}
+    return weights, {name: part for name, part in entry.items() if name == STATISTICS}
+
+
+def cosine(progress: float, *, start: float = 0.0, floor: float = 0.02) -> float:
+    """Decay of the learning rate: 1 up to progress ``start``, then half a cosine to ``floor``.
+
+    Args:
+      progress: fraction of the budget that is used up, in [0, 1].
+      start: where the decay starts, in [0, 1).
+      floor: the last factor.
+    """
+    part = min(max(progress - start, 0.0) / (1.0 - start), 1.0)
+    return floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * part))
+
+
+def halving(progress: float, *, times: int) -> float:
+    """Decay of the learning rate: halved after each of ``times`` equal parts of the budget but the last."""
+    return 0.5 ** min(math.floor(progress * times), times - 1)
+
+
+def constant(progress: float) -> float:
+    """No decay."""
+    return 1.0
+
+
+def learning_rate(
+    step: int, progress: float, *, peak: float, decay: Callable[[float], float] = cosine, warmup_steps: int = 20
+) -> float:
+    """Learning rate: linear warm-up over the first steps, times ``peak``, times the decay at this progress.
 
     The warm-up counts steps because on a clock the first step is mostly compilation.
 
@@ -50,8 +84,7 @@ def cosine(step: int, progress: float, *, peak: float, warmup_steps: int = 20, f
       step: steps taken.
       progress: fraction of the budget that is used up, in [0, 1].
       peak: largest rate.
+      decay: ``progress -> factor``.
       warmup_steps: length of the warm-up.
-      floor: last rate over ``peak``.
     """
-    warmup = min((step + 1) / warmup_steps, 1.0)
-    return warmup * peak * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0))))
+    return min((step + 1) / warmup_steps, 1.0) * peak * decay(progress)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import optax
 
 from essjax.frames import Sequence
-from essjax.train.objective import Objective
-from essjax.train.state import TrainState
-from essjax.typing import Array, Callable
+from essjax.train.objectives import Objective
+from essjax.train.state import TrainState, split_statistics
+from essjax.typing import Array, Callable, PyTree
 
 
 def make_train_step(
@@ -27,7 +27,8 @@ def make_train_step(
     finite changes nothing but the step count; the loop raises ``NonFiniteLoss``.
 
     Args:
-      objective: ``(variables, clip) -> terms``.
+      objective: ``(variables, clip) -> (terms, state)``; the statistics that it returns for ``trained`` are folded
+        into the variables, those of frozen entries are not.
       transform: the optimiser, without its learning rate.
       trained: the entry of ``variables`` that is differentiated; the others are frozen.
       compiler_options: for ``jax.jit``.
@@ -35,19 +36,23 @@ def make_train_step(
 
     @partial(jax.jit, donate_argnums=0, compiler_options=compiler_options)
     def step(state: TrainState, clip: Sequence, learning_rate: float):
-        def loss(part):
-            terms = objective({**state.variables, trained: part}, clip)
-            return sum(terms.values()), terms
+        weights, statistics = split_statistics(state.variables[trained])
 
-        (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(state.variables[trained])
+        def loss(weights):
+            terms, new = objective({**state.variables, trained: {**weights, **statistics}}, clip)
+            return sum(terms.values()), (terms, new.get(trained, {}))
+
+        (total, (terms, new_statistics)), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(total) & jnp.isfinite(norm)
-        updates, new_optimizer = transform.update(gradient, state.optimizer, state.variables[trained])
+        updates, new_optimizer = transform.update(gradient, state.optimizer, weights)
         updates = jax.tree.map(lambda update: -learning_rate * update, updates)
-        new_part = optax.apply_updates(state.variables[trained], updates)
-        new = ({**state.variables, trained: new_part}, new_optimizer)
-        old = (state.variables, state.optimizer)
-        variables, new_optimizer = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+        new_weights: PyTree = optax.apply_updates(weights, updates)
+        new_entry = {**statistics, **new_statistics, **new_weights}
+        new = (new_entry, new_optimizer)
+        old = (state.variables[trained], state.optimizer)
+        entry, new_optimizer = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+        variables = {**state.variables, trained: entry}
         state = dataclasses.replace(state, variables=variables, optimizer=new_optimizer, step=state.step + 1)
         return state, {**terms, "loss": total, "gradient_norm": norm}
 

@@ -36,7 +36,7 @@ def check_mode(mode: str, outside: str = "border") -> None:
         raise ValueError(f"outside: expected one of {', '.join(OUTSIDE)}, got {outside!r}.")
 
 
-def _cubic_weights(t: Array, a: float) -> list[Array]:
+def cubic_weights(t: Array, a: float) -> list[Array]:
     """Weights of the pixels at -1, 0, 1, 2 for fraction ``t`` in [0, 1) (Keys 1981, eq 4)."""
     inner = lambda d: ((a + 2.0) * d - (a + 3.0)) * d * d + 1.0  # noqa: E731 - d = distance in [0, 1]
     outer = lambda d: ((a * d - 5.0 * a) * d + 8.0 * a) * d - 4.0 * a  # noqa: E731 - d in [1, 2]
@@ -54,7 +54,7 @@ def axis_taps(positions: Array, size: int, mode: str, outside: str) -> list[Tap]
         x = positions - 0.5
         t = x - jnp.floor(x)
         first = jnp.floor(x) - (half - 1)
-        weights = [1.0 - t, t] if mode == "bilinear" else _cubic_weights(t, CUBIC_PARAMETER[mode])
+        weights = [1.0 - t, t] if mode == "bilinear" else cubic_weights(t, CUBIC_PARAMETER[mode])
     first = first.astype(jnp.int32)
     taps = []
     for k, weight in enumerate(weights):
@@ -108,7 +108,7 @@ def _sample_windows(image: Array, positions: Array, mode: str, outside: str) -> 
 def _axis_window(positions: Array, size: int, mode: str) -> tuple[Array, Array]:
     """First pixel ``[h, w]`` (may be outside) and the four cubic weights ``[h, w, 4]`` along one axis."""
     x = jnp.clip(positions.astype(jnp.float32), -3.0, size + 3.0) - 0.5
-    weights = _cubic_weights(x - jnp.floor(x), CUBIC_PARAMETER[mode])
+    weights = cubic_weights(x - jnp.floor(x), CUBIC_PARAMETER[mode])
     return jnp.floor(x).astype(jnp.int32) - 1, jnp.stack(weights, axis=-1)
 
 

@@ -1,7 +1,7 @@
 import pytest
 
 from experiments.config import PRESETS, make_config
-from experiments.variants import VARIANTS, compared, get_variant
+from experiments.variants import VARIANTS, compared, config_of, get_variant
 
 
 def test_overrides_are_typed():
@@ -40,6 +40,19 @@ def test_variants_are_listed_for_an_unknown_name():
 
 def test_a_comparison_ends_with_the_variant_and_names_it_once():
     for name in VARIANTS:
-        rows = compared(name)
+        rows = compared([name])
         assert rows[-1] == name and rows.count(name) == 1 and set(rows) <= set(VARIANTS)
-    assert "extrass-e" in compared("extrass") and "extrass-e" not in compared("extrass-w")
+    assert "extrass-e" in compared(["extrass"]) and "extrass-e" not in compared(["extrass-w"])
+
+
+def test_a_variant_changes_training_alone_and_the_command_line_has_the_last_word():
+    data = {"seed", "size", "scale", "mip_bias", "train_spp", "test_spp", "train_frames", "test_frames", "optimize"}
+    data |= {f"{split}_sequences" for split in ("train", "validation", "test")}
+    for name, variant in VARIANTS.items():
+        assert set(variant.presets) <= set(PRESETS), name
+        assert not data & {key for settings in variant.presets.values() for key in settings}, name
+        assert variant.weights is None or not (variant.presets or variant.stages(PRESETS["smoke"])), name
+        assert all(config_of(name, preset, []) for preset in PRESETS)
+    changed = {"quick": {"batch": 2, "width": 5}}
+    config = make_config("quick", ["width=7"], changed)
+    assert (config.batch, config.width) == (2, 7) and make_config("smoke", [], changed) == PRESETS["smoke"]

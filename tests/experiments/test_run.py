@@ -1,12 +1,13 @@
 """The run command end to end, small: two methods beside ExtraSS, one family, a handful of steps."""
 
+import dataclasses
 import functools
 import json
 
 import numpy as np
 import pytest
 
-from experiments import comparison, datasets, run, variants
+from experiments import compare, comparison, datasets, run, variants
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +17,7 @@ def finished(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr(variants, "BASELINES", ("extrass-w", "bilinear"))
     patch.setattr(datasets, "plan", functools.partial(datasets.plan, families=["carousel"]))
-    overrides = ["test_frames=7", "train_frames=5", "frnet_steps=2", "steps=2", "size=[32,24]", "crop=[32,24]"]
+    overrides = ["test_frames=7", "train_frames=5", "first_steps=2", "steps=2", "size=[32,24]", "crop=[32,24]"]
     code = run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides])
     yield out, code, overrides
     patch.undo()
@@ -83,7 +84,7 @@ def test_bad_arguments_are_one_line(arguments, message, tmp_path, capsys):
 
 def test_a_crop_that_is_too_small(finished, tmp_path, capsys):
     out, _, _ = finished
-    settings = ["crop=[32,16]", "frnet_steps=1", "steps=1"]
+    settings = ["crop=[32,16]", "first_steps=1", "steps=1"]
     arguments = ["--preset", "smoke", "--data", str(out / "scenes"), "--out", str(tmp_path / "out"), "--set", *settings]
     assert run.main(arguments) == 2
     assert "crop: expected at least 24x24 LR pixels" in capsys.readouterr().out.replace("\n", " ")
@@ -97,3 +98,37 @@ def test_list_names_all_variants(capsys):
 
 def test_taa_is_left_out_without_native_frames():
     assert "native" in comparison.table_references()["taa"]
+
+
+def test_compare_shares_one_training_between_variants_that_differ_in_their_steps(finished, tmp_path, monkeypatch):
+    """A twin of ``extrass-e`` with its weights: one training, two rows with the same numbers; the extra row is kept."""
+    scenes, _, overrides = finished
+    twin = dataclasses.replace(variants.VARIANTS["extrass-e"], weights="extrass-e")
+    monkeypatch.setitem(variants.VARIANTS, "twin", dataclasses.replace(twin, stages=lambda config: []))
+    monkeypatch.setattr(variants, "BASELINES", ("extrass-w",))
+    out = tmp_path / "out"
+    arguments = [
+        "--variants",
+        "extrass-e, twin",
+        "--preset",
+        "smoke",
+        "--data",
+        str(scenes / "scenes"),
+        "--out",
+        str(out),
+    ]
+    assert compare.main([*arguments, "--set", *overrides]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["environment"]["steps"] == {"frnet": 2} and metrics["variant"] == "extrass-e, twin"
+    rows = {row["method"]: row["psnr"] for row in metrics["rows"] if row["sequence"] == "mean"}
+    assert set(rows) == {"extrass-w", "extrass-e", "twin"} and rows["twin"] == rows["extrass-e"]
+    assert [path.name for path in (out / "variants").iterdir()] == ["extrass-e"]
+    assert compare.main([*arguments, "--set", *overrides, "--eval-only"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("names", "message"), [("", "expected names separated by commas"), ("warp,wrap", "unknown variant 'wrap'")]
+)
+def test_compare_names_what_is_wrong(names, message, tmp_path, capsys):
+    assert compare.main(["--variants", names, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().out.replace("\n", " ")

@@ -5,7 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from essjax.losses import charbonnier, feature_l1, hardest, l1, masked_mean, occlusion, sum_of_means, temporal_l1
+from essjax.losses import (
+    charbonnier,
+    feature_l1,
+    hardest,
+    l1,
+    masked_mean,
+    occlusion,
+    spatio_temporal,
+    sum_of_means,
+    temporal_l1,
+)
 from tests.helpers import random_image
 
 pytestmark = pytest.mark.usefixtures("strict_numerics")
@@ -121,3 +131,19 @@ def test_feature_l1_per_level():
     assert float(sum_of_means([])) == 0.0
     with pytest.raises(ValueError, match="as many levels on both sides, got 2 and 1"):
         feature_l1(a, b[:1])
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.3, 1.0])
+def test_spatio_temporal_is_equation_54(theta):
+    x, y = (np.asarray(random_image(seed, *SHAPE, low=-1.0, high=1.0), np.float64) for seed in (1, 2))
+    expected = np.abs(x) + np.abs(y) + theta * (np.abs(x - y) - np.abs(x) - np.abs(y))
+    got = spatio_temporal(jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), theta=theta)
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_spatio_temporal_messages():
+    image = jnp.zeros((5, 7, 3))
+    with pytest.raises(ValueError, match=r"theta: expected a share in \[0, 1\], got 1.5"):
+        spatio_temporal(image, image, theta=1.5)
+    with pytest.raises(ValueError, match="error and error_previous: expected the same shape"):
+        spatio_temporal(image, image[..., :1], theta=0.5)

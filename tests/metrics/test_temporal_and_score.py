@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from essjax.metrics import METRICS, aggregate, flicker, score_rollout, tpsnr, warped_error
+from essjax.metrics import METRICS, aggregate, flicker, score_rollout, spatio_temporal_error, tpsnr, warped_error
 from tests.helpers import random_image
 
 T, H, W = 5, 13, 18
@@ -36,6 +36,18 @@ def test_warped_error_follows_the_motion():
     expected = np.abs(np.asarray(image) - np.asarray(previous)).mean((1, 2, 3))
     np.testing.assert_allclose(warped_error(image, previous, still), expected, rtol=1e-5)
     assert np.isnan(warped_error(image, previous, motion, valid=0.0 * valid)).all()
+
+
+def test_spatio_temporal_error_follows_the_error_of_the_previous_frame():
+    target, error = random_image(1, 2, H, W, 3), random_image(2, 2, H, W, 3, low=-0.2, high=0.2)
+    motion = jnp.broadcast_to(jnp.array([-2.0, 0.0]), (2, H, W, 2))
+    # An error that moves with the surface costs nothing in time; what enters on the left repeats the border.
+    moved = jnp.concatenate([error[:, :, :1], error[:, :, :1], error[:, :, :-2]], axis=2)
+    arguments = (target + moved, target[:, ::-1] + error, target, target[:, ::-1], motion)
+    np.testing.assert_allclose(spatio_temporal_error(*arguments, theta=1.0), 0.0, atol=1e-6)
+    expected = 2 * np.abs(moved).mean((1, 2, 3))
+    np.testing.assert_allclose(spatio_temporal_error(*arguments, theta=0.0), expected, rtol=1e-5)
+    assert (np.asarray(spatio_temporal_error(*arguments[:4], -motion, theta=1.0)) > 0.1).all()
 
 
 @pytest.fixture(scope="module")

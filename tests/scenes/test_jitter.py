@@ -1,6 +1,7 @@
 import numpy as np
+import pytest
 
-from essjax.scenes.jitter import halton, jitter_sequence, reference_samples
+from essjax.scenes.jitter import dlctus_pattern, halton, jitter_sequence, reference_samples
 
 
 def test_halton_by_hand():
@@ -31,6 +32,41 @@ def test_even_frames_alone_and_odd_frames_alone_cover_the_pixel():
 
 def test_prefix_does_not_depend_on_length():
     np.testing.assert_array_equal(jitter_sequence(5), jitter_sequence(40)[:5])
+
+
+def test_dlctus_pattern_at_4x4_visits_every_output_pixel_without_neighbours():
+    cells = (dlctus_pattern(4) + 0.5) * 4 - 0.5
+    np.testing.assert_array_equal(cells, np.round(cells))  # centres of output pixels
+    assert len({tuple(cell) for cell in cells}) == 16
+    for before, after in zip(np.roll(cells, 1, axis=0), cells, strict=True):
+        step = np.abs(after - before)
+        assert np.minimum(step, 4 - step).max() == 2  # neither do they touch across the border of the input pixel
+    for start in range(16):
+        assert len({tuple(cell // 2) for cell in np.roll(cells, -start, axis=0)[:4]}) == 4
+
+
+def test_dlctus_pattern_at_2x2_by_hand():
+    positions = (dlctus_pattern(2) + 0.5) * 2
+    hourglass = [(0, 0), (1, 0), (0, 1), (1, 1)]
+    np.testing.assert_array_equal(np.floor(positions), hourglass * 4)
+    inside = [(1 / 4, 2 / 3), (3 / 4, 1 / 9), (1 / 8, 4 / 9), (5 / 8, 7 / 9)]  # Halton (2, 3), elements 2 to 5
+    np.testing.assert_allclose(positions - np.floor(positions), np.repeat(inside, 4, axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_dlctus_pattern_advances_every_frame_and_repeats_after_16(scale):
+    jitter = jitter_sequence(35, pattern="dlctus", scale=scale)
+    assert jitter.shape == (35, 2) and jitter.dtype == np.float32
+    assert (jitter >= -0.5).all() and (jitter < 0.5).all()
+    np.testing.assert_array_equal(jitter[16:32], jitter[:16])
+    assert len(np.unique(jitter[:16], axis=0)) == 16
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="jitter: expected one of halton, dlctus, got 'sobol'"):
+        jitter_sequence(3, pattern="sobol")
+    with pytest.raises(ValueError, match="the pattern dlctus exists for the scales 2 and 4, got 3. Use halton"):
+        jitter_sequence(3, pattern="dlctus", scale=3)
 
 
 def test_reference_samples_have_distinct_rows_and_columns():

@@ -63,6 +63,9 @@ def test_sequence_is_valid_with_native_frames_and_resumes():
     resumed = list(scenes.iterate_frames(scene, *SIZE, start=2, spp=4, native=True))
     assert [n for n, _ in resumed] == [2]
     leaves_equal(resumed[0][1], frames.select_time(sequence, 2))
+    other = scenes.render_frame(scene, 2, *SIZE, spp=4, native=True, jitter="dlctus")
+    np.testing.assert_array_equal(other.frames.jitter, scenes.jitter_sequence(3, pattern="dlctus")[2])
+    np.testing.assert_array_equal(other.native.jitter, sequence.native.jitter[2])
 
 
 def test_nothing_recompiles_for_another_frame_size_or_family():

@@ -1,5 +1,6 @@
 """The optimiser's state, the learning rate, and checkpoints that come back whole or say why not."""
 
+import functools
 import re
 
 import jax
@@ -8,7 +9,16 @@ import numpy as np
 import optax
 import pytest
 
-from essjax.train import Checkpoints, cosine, create_state, make_train_step, optimizer
+from essjax.train import (
+    Checkpoints,
+    constant,
+    cosine,
+    create_state,
+    halving,
+    learning_rate,
+    make_train_step,
+    optimizer,
+)
 from tests.train import tiny_run
 
 
@@ -22,14 +32,40 @@ def test_unknown_entry():
         create_state({"fit": {}, "frozen": {}}, "frnet", optimizer())
 
 
-def test_cosine():
-    rate = lambda step, progress: cosine(step, progress, peak=2.0, warmup_steps=10, floor=0.05)
+def test_learning_rate():
+    decay = functools.partial(cosine, floor=0.05)
+    rate = lambda step, progress: learning_rate(step, progress, peak=2.0, decay=decay, warmup_steps=10)
     np.testing.assert_allclose([rate(0, 0.0), rate(4, 0.0), rate(9, 0.0), rate(99, 0.0)], [0.2, 1.0, 2.0, 2.0])
     np.testing.assert_allclose(rate(99, 0.5), 2.0 * (0.05 + 0.95 * 0.5), rtol=1e-6)
     np.testing.assert_allclose(rate(4, 0.5), 0.5 * rate(99, 0.5), rtol=1e-6)  # a warm-up on a clock that runs
     np.testing.assert_allclose([rate(99, 1.0), rate(99, 1.5)], 0.1, rtol=1e-6)
     falling = [rate(99, progress) for progress in np.linspace(0.0, 1.0, 20)]
     assert all(a > b for a, b in zip(falling, falling[1:], strict=False))
+
+
+def test_decays():
+    late = [cosine(progress, start=0.2, floor=0.0) for progress in (0.0, 0.2, 0.6, 1.0)]
+    np.testing.assert_allclose(late, [1.0, 1.0, 0.5, 0.0], atol=1e-12)
+    assert [halving(progress, times=5) for progress in (0.0, 0.19, 0.21, 0.99, 1.0)] == [1.0, 1.0, 0.5, 0.0625, 0.0625]
+    assert constant(0.7) == 1.0
+
+
+def test_statistics_are_folded_in_and_have_no_gradient():
+    """The trained entry's new statistics arrive as returned; a frozen entry's do not."""
+    variables = {name: {"params": {"w": jnp.ones(2)}, "batch_stats": {"mean": jnp.full(2, 3.0)}} for name in "ab"}
+
+    def objective(variables, clip):
+        state = {name: {"batch_stats": {"mean": variables[name]["batch_stats"]["mean"] + 1.0}} for name in "ab"}
+        return {"sum": jnp.sum(variables["a"]["params"]["w"] * variables["a"]["batch_stats"]["mean"])}, state
+
+    transform = optimizer()
+    step = make_train_step(objective, transform, "a")
+    state, terms = step(create_state(variables, "a", transform), next(tiny_run.tiny_batches()), 0.1)
+    np.testing.assert_allclose(terms["gradient_norm"], 3.0 * np.sqrt(2.0), rtol=1e-6)
+    np.testing.assert_array_equal(state.variables["a"]["batch_stats"]["mean"], 4.0)
+    np.testing.assert_array_equal(state.variables["b"]["batch_stats"]["mean"], 3.0)
+    assert np.all(np.asarray(state.variables["a"]["params"]["w"]) < 1.0)
+    assert "batch_stats" not in jax.tree_util.keystr(jax.tree_util.tree_flatten_with_path(state.optimizer)[0][-1][0])
 
 
 def test_one_step_equals_adam_by_hand():

@@ -15,7 +15,7 @@ import numpy as np
 
 from essjax.data import clips
 from essjax.frames import select_time
-from essjax.train import Budget, Checkpoints, cosine, create_state, make_train_step, optimizer, train
+from essjax.train import Budget, Checkpoints, create_state, learning_rate, make_train_step, optimizer, train
 from tests.helpers import make_sequence
 
 STEPS = 12
@@ -31,10 +31,11 @@ def sequences():
 def objective(variables, clip):
     """Two terms, so that a test can tell which of them went wrong; they depend on the clip and so on its order."""
     color, reference = (jnp.mean(image, axis=(0, 1, 2, 3)) for image in (clip.frames.color, clip.reference))
-    return {
+    terms = {
         "near": jnp.sum((variables["fit"]["w"] - color) ** 2),
         "far": 0.1 * jnp.sum((variables["fit"]["w"] - reference) ** 2) + variables["frozen"]["b"],
     }
+    return terms, {}
 
 
 def initial_state():
@@ -59,7 +60,8 @@ def run(folder, *, budget=None, save_every=1e9, on_step=lambda step, progress, t
     try:
         return train(
             tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
-            budget or Budget(STEPS, None), functools.partial(cosine, peak=0.1), save_every=save_every, on_step=on_step,
+            budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), save_every=save_every,
+            on_step=on_step,
         )  # fmt: skip
     finally:
         checkpoints.close()

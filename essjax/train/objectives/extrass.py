@@ -1,12 +1,9 @@
-"""What each stage minimises: ``Objective = (variables, clip) -> {term: weighted scalar}``.
+"""What ExtraSS's two stages minimise.
 
 A clip is unrolled twice, one frame apart, so that every inner frame is predicted as SS and as ESS, each from the
 history that the alternation gives it at inference (ExtraSS section 4.5; docs/deviations.md says why not from one shared
 history). Losses are on log(1 + x).
 """
-
-import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -28,37 +25,9 @@ from essjax.losses import (
 )
 from essjax.methods.extrass import halve
 from essjax.networks.blocks import nearest_upsample
-from essjax.rollout import ESS, SS, alternate, unroll
+from essjax.rollout import ESS, SS
+from essjax.train.objectives.common import Objective, both_kinds, odd_length
 from essjax.typing import Array, Callable, PyTree
-
-Objective = Callable[[PyTree, Sequence], dict[str, Array]]
-
-
-def both_kinds(method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree]) -> dict[str, PyTree]:
-    """Unroll ``clip`` twice, the second time from frame 1, side by side in one scan; both alternate SS, ESS, SS, ...
-
-    Where one run renders the other extrapolates, so frames 1 ... T-2 are predicted as both kinds.
-
-    Returns:
-      kind -> ``keep(aux)`` of frames 1 ... T-2, time-major.
-    """
-    length = clip.frames.motion.shape[0]
-    if length < 3 or length % 2 == 0:
-        raise ValueError(f"clip: expected an odd number of frames >= 3 (SS/ESS pairs from 0 and from 1), got {length}.")
-    runs = jax.tree.map(lambda leaf: jnp.stack([leaf[:-1], leaf[1:]], axis=1), clip.frames)
-    runs = dataclasses.replace(runs, cut=runs.cut.at[0].set(True))
-    rollout = unroll(method, variables, runs, alternate(0), train=True, keep=keep)
-
-    def interleave(leaf: Array, first: int) -> Array:
-        """Frames 1, 2, ...: from run ``first`` the pair k, then from the other run the pair k + 1 (or k)."""
-        odd, even = leaf[:, first], leaf[:, 1 - first]
-        # Run 0 renders frames 0, 2, ... and extrapolates 1, 3, ...; run 1 renders 1, 3, ... and extrapolates 2, 4, ...
-        even = even[1:] if first == 1 else even[:-1]
-        pairs = jnp.stack([odd[:-1], even], axis=1).reshape(-1, *odd.shape[1:])
-        return jnp.concatenate([pairs, odd[-1:]])
-
-    ordered = {SS: 1, ESS: 0}  # the run that has frame 1 as this kind
-    return {kind: jax.tree.map(partial(interleave, first=run), rollout.aux[kind]) for kind, run in ordered.items()}
 
 
 def frnet_objective(method: Method, network: Network, *, feature_weight: float = 0.001) -> Objective:
@@ -70,17 +39,20 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
       feature_weight: lambda of eq 9.
     """
 
-    def objective(variables: PyTree, clip: Sequence) -> dict[str, Array]:
-        predicted = both_kinds(method, variables, clip, keep=lambda aux: aux.get("extrapolated", {}))[ESS]
+    def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
+        clip = odd_length(clip)
+        kinds, state = both_kinds(method, variables, clip, keep=lambda aux: aux.get("extrapolated", {}))
+        predicted = kinds[ESS]
         target = log1p(halve(rendered_color(clip.frames, "frnet")[1:-1]))
         # The target's features are given: learned from this side too, they shrink until nothing differs.
         features, _ = network.apply(jax.lax.stop_gradient(variables["frnet"]), target, method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted.features, features, strict=True)]
-        return {
+        terms = {
             "charbonnier": jnp.mean(charbonnier(predicted.half, target)),
             "census": jnp.mean(census(predicted.half, target)),
             "feature_census": feature_weight * sum_of_means(distances),
         }
+        return terms, state
 
     return objective
 
@@ -106,8 +78,9 @@ def extrass_objective(
     def keep(aux: dict) -> dict:
         return {name: aux[name] for name in ("log_image", "warped", "features")}
 
-    def objective(variables: PyTree, clip: Sequence) -> dict[str, Array]:
-        kinds = both_kinds(method, variables, clip, keep)
+    def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
+        clip = odd_length(clip)
+        kinds, state = both_kinds(method, variables, clip, keep)
         target = log1p(clip.reference[1:-1])
         terms: dict[str, Array] = {}
         for kind, predicted in kinds.items():
@@ -123,6 +96,6 @@ def extrass_objective(
         # E1 follows E0: drawn to each other, both shrink to zero (experiments/LOG.md).
         levels = feature_l1(jax.lax.stop_gradient(kinds[SS]["features"]), kinds[ESS]["features"])
         terms["features"] = temporal_weight * sum_of_means(levels)
-        return terms
+        return terms, state
 
     return objective

@@ -12,8 +12,7 @@ from essjax.interfaces import Method, MethodInfo, Network, reset_at_cut
 from essjax.losses import census, feature_census
 from essjax.methods.extrass import Warped
 from essjax.rollout import ESS, SS
-from essjax.train import extrass_objective, frnet_objective
-from essjax.train.objective import both_kinds
+from essjax.train import both_kinds, extrass_objective, frnet_objective
 from tests.helpers import make_sequence, random_image
 
 T, B, H, W = 5, 2, 14, 18
@@ -53,7 +52,7 @@ def test_both_kinds_gives_every_inner_frame_once_per_kind_in_order(length):
         number = frame.motion[..., 0, 0, 0]
         return {"frame": number, "kind": jnp.full_like(number, kind), "before": history}
 
-    kinds = jax.jit(lambda clip: both_kinds(fake(aux), {}, clip, keep=lambda aux: aux))(numbered(length))
+    kinds, _ = jax.jit(lambda clip: both_kinds(fake(aux), {}, clip, keep=lambda aux: aux))(numbered(length))
     assert set(kinds) == {SS, ESS}
     inner = np.arange(1, length - 1)
     for name, number in ((SS, 0), (ESS, 1)):
@@ -106,7 +105,7 @@ def test_extrass_terms_equal_numpy(exact_masks):
     objective = extrass_objective(
         fake(extrass_aux), occlusion_weight=2.0, vgg_weight=0.5, temporal_weight=3.0, vgg_features=vgg
     )
-    terms = jax.jit(objective)({}, clip)
+    terms, _ = jax.jit(objective)({}, clip)
 
     brightness = np.repeat(1.0 + 0.1 * np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
     target = np.log1p(np.asarray(clip.reference[1:-1]))
@@ -129,7 +128,7 @@ def test_extrass_terms_equal_numpy(exact_masks):
 
 
 def test_without_vgg_there_is_no_such_term():
-    terms = jax.eval_shape(extrass_objective(fake(extrass_aux)), {}, numbered(3))
+    terms, _ = jax.eval_shape(extrass_objective(fake(extrass_aux)), {}, numbered(3))
     assert not any(name.startswith("vgg") for name in terms)
 
 
@@ -158,7 +157,7 @@ def test_frnet_terms_equal_numpy():
 
     clip = numbered(T)
     objective = frnet_objective(fake(aux), Network(None, encode), feature_weight=0.5)
-    terms = jax.jit(objective)({"frnet": jnp.float32(2.0)}, clip)
+    terms, _ = jax.jit(objective)({"frnet": jnp.float32(2.0)}, clip)
 
     brightness = np.repeat(1.0 + 0.1 * np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
     color = np.asarray(clip.frames.color[1:-1]).reshape(T - 2, B, H // 2, 2, W // 2, 2, 3)

@@ -1,0 +1,6 @@
+"""What each stage minimises: ``Objective = (variables, clip) -> ({term: weighted scalar}, statistics)``."""
+
+from essjax.train.objectives.common import Objective, both_kinds, odd_length
+from essjax.train.objectives.extrass import extrass_objective, frnet_objective
+
+__all__ = ["Objective", "both_kinds", "extrass_objective", "frnet_objective", "odd_length"]

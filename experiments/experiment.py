@@ -1,0 +1,213 @@
+"""One experiment, whether of one variant (``experiments.run``) or of several (``experiments.compare``).
+
+Data, training, tuning of the baselines, evaluation, report: each part resumes where an interrupted run left off.
+"""
+
+import json
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from essjax.data import Dataset
+from experiments import datasets
+from experiments.comparison import Trained, make_runners, notes, table_references
+from experiments.config import Config
+from experiments.evaluate import evaluate, load_clip
+from experiments.report import print_table, write_report
+from experiments.training import restore_stages, train_stages
+from experiments.variants import stages_of, trained_as
+
+
+def claim(out: Path, wanted: Mapping[str, Any], *, resume: bool, eval_only: bool) -> None:
+    """Record in ``out / "run.json"`` what runs there; refuse to mix two runs or to start over one that can be resumed.
+
+    Raises:
+      ValueError: ``out`` holds another run, or one that was not asked to continue.
+    """
+    path, wanted = out / "run.json", json.loads(json.dumps(wanted))
+    if path.exists():
+        found = json.loads(path.read_text())
+        if not (resume or eval_only):
+            raise ValueError(
+                f"{out} already holds a run. Continue it with --resume, evaluate it with --eval-only, "
+                "or choose another --out."
+            )
+        different = [key for key in wanted if found.get(key) != wanted[key]]
+        if different:
+            pairs = ", ".join(f"{key} was {found.get(key)}, now {wanted[key]}" for key in different)
+            raise ValueError(f"{out} holds a run with other settings: {pairs}. Use the same ones, or another --out.")
+    elif eval_only:
+        raise ValueError(f"--eval-only: {out} holds no run. Give the --out of a trained one.")
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(path, wanted)
+
+
+def run_experiment(
+    names: Sequence[str],
+    configs: Mapping[str, Config],
+    folders: Mapping[str, Path],
+    *,
+    preset: str,
+    data: str | None,
+    out: Path,
+    eval_only: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Run everything and write ``out / "metrics.json"`` and ``out / "report"``.
+
+    Args:
+      names: the variants.
+      configs: variant -> its settings; all agree in everything but training.
+      folders: variant -> where its checkpoints and logs lie.
+      preset: name of the preset, for the record.
+      data: a dataset's folder, or None to render the built-in scenes into ``out``.
+      out: folder of the results.
+      eval_only: do not train, restore.
+      console: where progress and tables are printed.
+
+    Returns:
+      The content of ``metrics.json``.
+    """
+    config, clock, seconds = configs[names[0]], time.monotonic(), {}
+
+    def lap(name: str) -> None:
+        nonlocal clock
+        now = time.monotonic()
+        seconds[name], clock = round(now - clock, 1), now
+
+    with Progress(*_COLUMNS, console=console) as progress:
+        bar = progress.add_task("data", total=None, text="")
+
+        def on_frame(n: int, total: int) -> None:
+            progress.update(bar, completed=n, total=total, text=f"{n}/{total}")
+
+        dataset = datasets.prepare(config, data, out, on_frame)
+        progress.update(bar, completed=1, total=1, text=f"{len(dataset.sequences)} sequences")
+        console.print(datasets.describe(dataset), soft_wrap=True)
+        lap("data")
+
+        trained = _train_all(names, configs, folders, dataset, eval_only, progress)
+        lap("training")
+
+        bar = progress.add_task("evaluate", total=None, text="reading")
+        segments = {split: dataset.segments(split) for split in ("validation", "test")}
+        clips = {split: [load_clip(dataset, s, config.warmup) for s in segments[split]] for split in segments}
+        runners, settings = make_runners(
+            names, config, trained, clips["validation"], out, lambda text: progress.update(bar, text=text)
+        )
+        lap("tuning")
+        progress.update(bar, total=len(runners) * len(clips["test"]), completed=0)
+        result = evaluate(
+            runners,
+            clips["test"],
+            pictures=config.pictures,
+            on_step=lambda text: progress.update(bar, advance=1, text=text),
+        )
+        progress.update(bar, text="done")
+        lap("evaluation")
+    metrics = {
+        "schema": 1,
+        "variant": ", ".join(names),
+        "preset": preset,
+        "dataset": datasets.describe(dataset),
+        "environment": environment(config, {name: found.report for name, found in trained.items()}),
+        "settings": {name: setting._asdict() for name, setting in settings.items()},
+        "seconds": seconds,
+        "rows": result["rows"],
+    }
+    remarks = notes(dataset, clips["test"], settings, config)
+    page = write_report(
+        out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=table_references()
+    )
+    lap("report")
+    metrics["seconds"] = {**seconds, "total": round(sum(seconds.values()), 1)}
+    write_json(out / "metrics.json", metrics)
+    print_table(metrics, references=table_references(), console=console)
+    for remark in remarks:
+        console.print(f"[dim]{remark}[/dim]", soft_wrap=True)
+    spent = ", ".join(f"{name} {value:.0f} s" for name, value in metrics["seconds"].items())
+    console.print(f"{spent}\nmetrics: {out / 'metrics.json'}\nreport:  {page}", soft_wrap=True)
+    return metrics
+
+
+_COLUMNS = (
+    TextColumn("{task.description:<16}"),
+    BarColumn(),
+    TextColumn("{task.fields[text]}"),
+    TimeElapsedColumn(),
+)
+
+
+def _train_all(
+    names: Sequence[str],
+    configs: Mapping[str, Config],
+    folders: Mapping[str, Path],
+    dataset: Dataset,
+    eval_only: bool,
+    progress: Progress,
+) -> dict[str, Trained]:
+    """Train (or restore) each variant that ``names`` take their weights from, once."""
+    trained: dict[str, Trained] = {}
+    bars: dict[str, Any] = {}
+    for name in names:
+        base, config = trained_as(name), configs[name]
+        stages = stages_of(name, config)
+        if base in trained or not stages:
+            continue
+        if not config.vgg and base == "extrass":
+            progress.console.print(
+                "VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on.",
+                soft_wrap=True,
+            )
+
+        def on_step(stage: str, step: int, fraction: float, terms: dict[str, float], base: str = base) -> None:
+            label = stage if len(names) == 1 else f"{base}: {stage}"
+            if label not in bars:
+                bars[label] = progress.add_task(f"train {label}", total=1.0, text="")
+            progress.update(bars[label], completed=fraction, text=f"step {step}, loss {terms['loss']:.4f}")
+
+        folder = folders[name]
+        if eval_only:
+            variables, report = restore_stages(stages, dataset, config, folder)
+        else:
+            variables, report = train_stages(stages, dataset, config, folder, on_step)
+        trained[base] = Trained(variables, config, report)
+    return trained
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write or replace ``path`` at once, never half."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(content, indent=1) + "\n")
+    temporary.replace(path)
+
+
+def environment(config: Config, reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Commit, device, versions, seed and steps (stage -> steps; of several variants "variant/stage" -> steps)."""
+    root = Path(__file__).resolve().parent.parent
+    try:
+        git = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+        commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "unknown"
+    packages = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
+    return {
+        "commit": commit,
+        "device": f"{jax.devices()[0].device_kind} ({jax.default_backend()}), {os.cpu_count()} CPU cores",
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
+        "seed": config.seed,
+        "steps": {
+            stage if len(reports) == 1 else f"{name}/{stage}": found["steps"]
+            for name, report in reports.items()
+            for stage, found in report.items()
+        },
+    }
