@@ -2,12 +2,20 @@
 
 from essjax.train.checkpoint import Checkpoints
 from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, train
-from essjax.train.objectives import Objective, both_kinds, extrass_objective, frnet_objective, odd_length
+from essjax.train.objectives import (
+    Objective,
+    both_kinds,
+    extrass_objective,
+    frnet_objective,
+    ifrnet_objective,
+    nsrr_objective,
+    odd_length,
+)
 from essjax.train.state import TrainState, constant, cosine, create_state, halving, learning_rate, optimizer
 from essjax.train.step import make_train_step
 
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds", "constant",
-    "cosine", "create_state", "extrass_objective", "frnet_objective", "halving", "learning_rate", "make_train_step",
-    "odd_length", "optimizer", "train",
+    "cosine", "create_state", "extrass_objective", "frnet_objective", "halving", "ifrnet_objective", "learning_rate",
+    "make_train_step", "nsrr_objective", "odd_length", "optimizer", "train",
 ]  # fmt: skip

@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, extrass
+from experiments.variants import baselines, extrass, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
+    **nsrr.VARIANTS,
+    **interpolation.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""

@@ -1,4 +1,4 @@
-"""What objectives are, and the rollout that predicts every frame as both kinds."""
+"""What objectives are, and the rollouts behind them: every frame as both kinds, or the last frame alone."""
 
 import dataclasses
 from functools import partial
@@ -6,9 +6,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from essjax.frames import Sequence, select_time
+from essjax.frames import Frame, Prediction, Sequence, select_time
 from essjax.interfaces import Method
-from essjax.rollout import ESS, SS, alternate, unroll
+from essjax.rollout import ESS, SS, Schedule, alternate, unroll
 from essjax.typing import Array, Callable, PyTree
 
 Objective = Callable[[PyTree, Sequence], tuple[dict[str, Array], PyTree]]
@@ -52,3 +52,21 @@ def odd_length(clip: Sequence) -> Sequence:
     """``clip`` without its last frame if their number is even: what ``both_kinds`` takes."""
     length = clip.frames.motion.shape[0]
     return clip if length % 2 else select_time(clip, slice(0, length - 1))
+
+
+def last_prediction(method: Method, variables: PyTree, frames: Frame, schedule: Schedule) -> Prediction:
+    """What the step of the last of ``frames`` returns, for losses on it alone; its state is a dict also without one.
+
+    The steps before it are not scanned: of them only what the history holds is computed and differentiated.
+
+    Args:
+      method: the two steps.
+      variables: from ``method.init``.
+      frames: leaves ``[T, ...]``; frame 0 counts as the first of a shot.
+      schedule: must render the last frame.
+    """
+    length = frames.motion.shape[0]
+    frames = dataclasses.replace(frames, cut=frames.cut.at[0].set(True))
+    before = select_time(frames, slice(0, length - 1))
+    history = unroll(method, variables, before, Schedule(schedule.kinds, 1, length), train=True).history
+    return method.render_step(variables, history, select_time(frames, length - 1), train=True)[1]
