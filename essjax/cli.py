@@ -65,7 +65,8 @@ def _print_dataset(dataset: Dataset) -> None:
         for segment in segments:
             table.add_row(split, segment.sequence, f"{segment.first}-{segment.last}", str(segment.score_from))
     _console.print(table)
-    _console.print(f"buffers: {', '.join(info.channels)}" + ("; native frames" if info.native else ""))
+    extra = ("; native frames" if info.native else "") + ("; sample ranges" if info.ranges else "")
+    _console.print(f"buffers: {', '.join(info.channels)}{extra}")
 
 
 def scenes(
@@ -79,6 +80,7 @@ def scenes(
     spp: int = 64,
     families: str = "",
     native: bool = False,
+    ranges: bool = False,
     seed: int = 0,
     mip_bias: float = 0.0,
     jitter: Literal["halton", "dlctus"] = "halton",
@@ -95,6 +97,7 @@ def scenes(
       spp: Samples per pixel of the reference.
       families: Only these, separated by commas; all of the split if empty.
       native: Also 1-sample frames at the reference's size, the input of native TAA.
+      ranges: Also the ranges over the reference's samples, which a classifier is trained on.
       seed: Skip this many seeds of the split.
       mip_bias: Texture filter, log2 of its width over an output pixel's.
       jitter: Pattern of the sample positions: halton serves half the frames as well as all, dlctus only all of them.
@@ -102,8 +105,8 @@ def scenes(
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None
     clips = plan(split, sequences, frames, spp=spp, families=chosen, start=seed)
+    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
     with progress_bar("rendering") as progress:
-        settings = {"scale": scale, "native": native, "mip_bias": mip_bias, "jitter": jitter}
         dataset = generate(out, clips, width, height, progress=progress, **settings)
     _print_dataset(dataset)
 

@@ -73,6 +73,29 @@ class Frame:
 
 
 @pytree
+class SampleRanges:
+    """What all sub-samples of each reference pixel saw, unjittered: classifier labels are made of it (Guo et al. 2022).
+
+    Attributes:
+      depth_min: ``[..., sH, sW, 1]`` metres, background +inf.
+      depth_max: the same, largest.
+      color_min: ``[..., sH, sW, 3]`` linear radiance, smallest per channel.
+      color_max: the same, largest.
+      normal_spread: ``[..., sH, sW, 1]`` largest L1 distance of a sample's normal to the first sample's.
+      normal_spread_smooth: the same without bump detail.
+      motion: ``[..., sH, sW, 2]`` of the nearest sample, current to previous, pixels of the reference.
+    """
+
+    depth_min: Plane
+    depth_max: Plane
+    color_min: Color
+    color_max: Color
+    normal_spread: Plane
+    normal_spread_smooth: Plane
+    motion: Motion
+
+
+@pytree
 class Sequence:
     """Frames stacked in time, with what they are scored against. Leading axes ``[T, ...]``.
 
@@ -85,6 +108,7 @@ class Sequence:
       steady: ``[T, ..., H, W, 1]`` LR, 1 where the shading is known not to move against the surface (no mirror image,
         no changing shadow); from the renderer only.
       native: frames at the reference's resolution with a jitter of their own (the input of native TAA); or None.
+      ranges: over all samples of each reference pixel, from the renderer only; or None.
     """
 
     frames: Frame
@@ -92,6 +116,7 @@ class Sequence:
     valid: Mask | None = None
     steady: Mask | None = None
     native: Frame | None = None
+    ranges: SampleRanges | None = None
 
     @property
     def scale(self) -> int:
@@ -134,6 +159,11 @@ CHANNELS = {
     "world_position": 3, "stencil": 1, "n_dot_v": 1, "motion": 2, "reactive": 1,
 }  # fmt: skip
 """Number of channels of every image a frame may hold."""
+RANGE_CHANNELS = {
+    "depth_min": 1, "depth_max": 1, "color_min": 3, "color_max": 3, "normal_spread": 1, "normal_spread_smooth": 1,
+    "motion": 2,
+}  # fmt: skip
+"""Number of channels of every image of ``SampleRanges``."""
 
 
 def frame_images(frame: Frame) -> dict[str, jax.Array | np.ndarray]:
@@ -231,7 +261,7 @@ def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] =
 
 
 def validate_sequence(sequence: Sequence, name: str = "sequence", requires: Iterable[str] = ()) -> None:
-    """``validate_frame`` for each frame, and the sizes of reference, masks and native frames against the frames'."""
+    """``validate_frame`` for each frame; reference, masks, native frames and ranges against the frames' size."""
     frames = sequence.frames
     height, width = frames.motion.shape[-3:-1]
     length = frames.motion.shape[0]
@@ -250,12 +280,34 @@ def validate_sequence(sequence: Sequence, name: str = "sequence", requires: Iter
     if sequence.native is not None and sequence.native.motion.shape[-3:-1] != (high, wide):
         size = sequence.native.motion.shape[-3:-1]
         raise ValueError(f"{name}, native frames: expected {wide}x{high} as the reference, got {size[1]}x{size[0]}.")
+    if sequence.ranges is not None:
+        validate_ranges(sequence.ranges, high, wide, f"{name}, ranges")
     for index in range(length):
         frame = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), frames)
         validate_frame(frame, f"{name}, frame {index}", requires)
         reference = np.asarray(sequence.reference[index])
         bad = ~np.isfinite(reference) | (reference < 0)
         _reject(bad, reference, f"{name}, frame {index}", "reference", "finite radiance >= 0", "Re-render this frame.")
+
+
+def validate_ranges(ranges: SampleRanges, height: int, width: int, where: str = "ranges") -> None:
+    """Raise a ValueError that names ``where`` and the image unless ``ranges`` are ranges of ``height`` x ``width``.
+
+    Checks sizes, finite values (depth may be +inf: background) and that no minimum is above its maximum.
+    """
+    images = {name: np.asarray(getattr(ranges, name)) for name in RANGE_CHANNELS}
+    for name, image in images.items():
+        expected = (height, width, RANGE_CHANNELS[name])
+        if image.shape[-3:] != expected:
+            raise ValueError(
+                f"{where}, {name}: expected [..., {height}, {width}, {expected[-1]}] (the reference's size), "
+                f"got {tuple(image.shape)}."
+            )
+        bad = np.isnan(image) if name.startswith("depth") else ~np.isfinite(image)
+        _reject(bad, image, where, name, "numbers", "Re-render this frame.")
+    for name in ("depth", "color"):
+        low, high = images[f"{name}_min"], images[f"{name}_max"]
+        _reject(low > high, low, where, f"{name}_min", f"at most {name}_max", "Re-render this frame.")
 
 
 def select_time(tree: PyTree, index: int | slice) -> PyTree:

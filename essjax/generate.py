@@ -10,7 +10,7 @@ import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
 from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
 
-UNSAID = {"jitter": "halton"}
+UNSAID = {"jitter": "halton", "ranges": False}
 """Settings that a dataset names only if they differ from these: it may be older than the choice."""
 Progress = Callable[[int, int], Any]
 """Called with (frames done, frames in all)."""
@@ -105,6 +105,7 @@ def generate(
     *,
     scale: int = 2,
     native: bool = False,
+    ranges: bool = False,
     mip_bias: float = 0.0,
     jitter: str = "halton",
     progress: Progress = lambda done, total: None,
@@ -121,6 +122,7 @@ def generate(
       height: LR height, pixels.
       scale: reference size over frame size.
       native: also frames at the reference's size (the input of native TAA).
+      ranges: also the ranges over the reference's samples (what a classifier's labels are made of).
       mip_bias: texture filter, see ``scenes.render_frame``.
       jitter: pattern, "halton" or "dlctus", see ``scenes.jitter_sequence``.
       progress: called after each frame.
@@ -131,7 +133,8 @@ def generate(
     out, clips = Path(out), list(clips)
     shared = {"renderer": "essjax.scenes", "width": width, "height": height, "scale": scale, "native": native}
     shared["mip_bias"] = float(mip_bias)
-    shared |= {"jitter": jitter} if jitter != UNSAID["jitter"] else {}
+    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+    shared |= {key: settings[key] for key, usual in UNSAID.items() if settings[key] != usual}
     splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
     for clip in clips:
@@ -139,13 +142,9 @@ def generate(
         writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
         for index in range(clip.frames):
             if index not in writer:
-                frame = render_frame(
-                    scene, index, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias,
-                    jitter=jitter,
-                )  # fmt: skip
-                writer.write(
-                    index, frame.frames, frame.reference, valid=frame.valid, steady=frame.steady, native=frame.native
-                )
+                frame = render_frame(scene, index, width, height, spp=clip.spp, **settings)
+                extra = {name: getattr(frame, name) for name in ("valid", "steady", "native", "ranges")}
+                writer.write(index, frame.frames, frame.reference, **extra)
             done += 1
             progress(done, total)
         writer.finish()
@@ -161,6 +160,7 @@ def live_source(
     *,
     scale: int = 2,
     native: bool = False,
+    ranges: bool = False,
     mip_bias: float = 0.0,
     jitter: str = "halton",
     on_frame: Callable[[int], Any] | None = None,
@@ -173,6 +173,7 @@ def live_source(
       height: LR height, pixels.
       scale: see ``generate``.
       native: see ``generate``.
+      ranges: see ``generate``.
       mip_bias: see ``generate``.
       jitter: see ``generate``.
       on_frame: called with the index of each finished frame of a clip.
@@ -180,9 +181,7 @@ def live_source(
 
     def render(clip: Clip) -> essjax.frames.Sequence:
         scene = make_scene(clip.family, clip.seed, clip.frames)
-        return render_sequence(
-            scene, width, height, scale=scale, spp=clip.spp, native=native, mip_bias=mip_bias, jitter=jitter,
-            on_frame=on_frame,
-        )  # fmt: skip
+        settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+        return render_sequence(scene, width, height, spp=clip.spp, on_frame=on_frame, **settings)
 
     return CachedSource(functools.partial(render, clip) for clip in clips)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.frames import Frame, GBuffers, Sequence
+from essjax.frames import Frame, GBuffers, SampleRanges, Sequence
 
 
 def random_image(seed: int, *shape: int, low: float = 0.0, high: float = 2.0) -> jax.Array:
@@ -68,14 +68,42 @@ def make_frames(
     return jax.tree.map(jnp.asarray, frames)
 
 
+def make_ranges(seed: int, *shape: int, motion_range: float = 3.0, sky: float = 0.1) -> SampleRanges:
+    """Random ranges ``[*shape, C]``; a share ``sky`` of the pixels sees background, half of them with other samples."""
+    rng = np.random.default_rng(seed)
+    near, far = np.sort(rng.uniform(1.0, 20.0, (2, *shape, 1)), axis=0)
+    low, high = np.sort(rng.uniform(0.0, 2.0, (2, *shape, 3)), axis=0)
+    chance = rng.uniform(size=(*shape, 1))
+    smooth, bumps = rng.uniform(0.0, 1.0, (2, *shape, 1))
+    ranges = SampleRanges(
+        depth_min=np.where(chance < sky / 2, np.inf, near),
+        depth_max=np.where(chance < sky, np.inf, far),
+        color_min=low,
+        color_max=high,
+        normal_spread=smooth + bumps,
+        normal_spread_smooth=smooth,
+        motion=rng.uniform(-motion_range, motion_range, (*shape, 2)),
+    )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), ranges)
+
+
 def make_sequence(
-    seed: int = 0, T: int = 5, B: int = 2, H: int = 12, W: int = 18, *, scale: int = 2, native: bool = False
+    seed: int = 0,
+    T: int = 5,
+    B: int = 2,
+    H: int = 12,
+    W: int = 18,
+    *,
+    scale: int = 2,
+    native: bool = False,
+    ranges: bool = False,
 ) -> Sequence:
-    """``make_frames`` with a random reference and mask, and native frames on request."""
+    """``make_frames`` with a random reference and mask, and native frames and ranges on request."""
     rng = np.random.default_rng(seed + 1000)
     return Sequence(
         frames=make_frames(seed, T, B, H, W),
         reference=jnp.asarray(rng.uniform(0.0, 2.0, (T, B, scale * H, scale * W, 3)), jnp.float32),
         valid=jnp.asarray(rng.uniform(size=(T, B, H, W, 1)) < 0.8, jnp.float32),
         native=make_frames(seed + 1, T, B, scale * H, scale * W) if native else None,
+        ranges=make_ranges(seed + 2, T, B, scale * H, scale * W) if ranges else None,
     )

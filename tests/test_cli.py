@@ -29,9 +29,9 @@ def instant_renderer(monkeypatch):
     """Frames of noise in place of rendered ones; returns the list of (family, seed, frame) that were asked for."""
     calls = []
 
-    def render_frame(scene, index, width, height, *, scale, spp, native, mip_bias, jitter):
+    def render_frame(scene, index, width, height, *, scale, spp, native, ranges, mip_bias, jitter):
         calls.append((scene.family, scene.seed, index))
-        noise = make_sequence(scene.seed, index + 1, 1, height, width, scale=scale, native=native)
+        noise = make_sequence(scene.seed, index + 1, 1, height, width, scale=scale, native=native, ranges=ranges)
         frame = select_time(jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), noise), index)
         return dataclasses.replace(frame, steady=frame.valid)
 
@@ -102,6 +102,8 @@ def test_a_dataset_grows_but_does_not_change(tmp_path, instant_renderer):
         generate(tmp_path, plan("train", 1, 3, families=["texture"]), 8, 6)
     with pytest.raises(ValueError, match=r"made with width = 8, asked for 10\. Choose another output folder"):
         generate(tmp_path, gloss, 10, 6)
+    with pytest.raises(ValueError, match=r"made with ranges = False, asked for True\. Choose another output folder"):
+        generate(tmp_path, gloss, 8, 6, ranges=True)
     with pytest.raises(ValueError, match="made with jitter = 'halton', asked for 'dlctus'"):
         generate(tmp_path, gloss, 8, 6, jitter="dlctus")
     with pytest.raises(ValueError, match=r"other settings \(frames: asked 4, found 3\)"):
@@ -115,12 +117,13 @@ def test_scenes_command_renders_what_the_live_source_renders(tmp_path, capsys):
     """The real renderer: the same frames through the disk (half precision) and straight into memory."""
     code, output = run(
         capsys, "scenes", tmp_path / "out", "--split", "train", "--sequences", "1", "--frames", "3", "--size", "16x10",
-        "--families", "corridor", "--spp", "4", "--jitter", "dlctus",
+        "--families", "corridor", "--spp", "4", "--jitter", "dlctus", "--ranges",
     )  # fmt: skip
     assert code == 0 and "train-corridor-0000" in output and "0-2" in output and "color, base_color" in output
+    assert output.endswith("steady; sample ranges")
     dataset = read_dataset(tmp_path / "out")
-    disk = read_sequence(dataset, "train-corridor-0000")
-    source = live_source(plan("train", 1, 3, families=["corridor"], spp=4), 16, 10, jitter="dlctus")
+    disk = read_sequence(dataset, "train-corridor-0000", ranges=True)
+    source = live_source(plan("train", 1, 3, families=["corridor"], spp=4), 16, 10, ranges=True, jitter="dlctus")
     validate_sequence(source[0], "live")
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), disk, source[0])
     assert next(iter(clips(source, length=2, batch=2, crop=(8, 8)))).reference.shape == (2, 2, 16, 16, 3)

@@ -29,7 +29,7 @@ def spoil(image, at, value):
 
 def test_random_frames_are_valid():
     fr.validate_frame(one_frame(), requires=("color", *fr.OPTIONAL_GBUFFERS))
-    fr.validate_sequence(make_sequence(3, T=2, B=1, H=4, W=6, native=True))
+    fr.validate_sequence(make_sequence(3, T=2, B=1, H=4, W=6, native=True, ranges=True))
 
 
 def test_frames_are_pytrees_with_none_for_absent():
@@ -171,3 +171,23 @@ def test_reset_at_cut_is_per_batch_element():
     np.testing.assert_array_equal(history["n"], [0, 1, 0])
     assert expand_flag(jnp.zeros((4, 3), bool), 5).shape == (4, 3, 1, 1, 1)
     assert no_variables(jax.random.key(0), one_frame()) == {}
+
+
+def test_ranges_are_checked():
+    sequence = make_sequence(3, T=2, B=1, H=4, W=6, ranges=True)
+    ranges = sequence.ranges
+
+    def complaint(**changes):
+        changed = dataclasses.replace(ranges, **changes)
+        with pytest.raises(ValueError) as error:
+            fr.validate_sequence(dataclasses.replace(sequence, ranges=changed), "market")
+        return str(error.value)
+
+    text = complaint(normal_spread=ranges.normal_spread[..., :4, :, :])
+    assert text.startswith("market, ranges, normal_spread: expected [..., 8, 12, 1] (the reference's size), got (2, 1,")
+    text = complaint(color_max=ranges.color_min - 0.5)
+    assert "market, ranges, channel color_min: expected at most color_max, got" in text
+    text = complaint(motion=ranges.motion.at[1, 0, 3, 2, 1].set(jnp.nan))
+    assert "market, ranges, channel motion: expected numbers, got nan at (1, 0, 3, 2, 1)" in text
+    text = complaint(depth_min=ranges.depth_min.at[:].set(jnp.inf))
+    assert "channel depth_min: expected at most depth_max, got inf" in text

@@ -4,7 +4,8 @@ from essjax.data.augment import crop, flip, start_with_cut
 from essjax.data.importing import PRESETS, ImportReport, import_dataset
 from essjax.data.layout import Dataset, Segment, SequenceInfo, read_dataset, write_dataset
 from essjax.data.loader import CachedSource, Source, clips, disk_source
-from essjax.data.store import SequenceWriter, read_segment, read_sequence, write_sequence
+from essjax.data.read import read_segment, read_sequence
+from essjax.data.store import SequenceWriter, write_sequence
 
 __all__ = [
     "PRESETS", "CachedSource", "Dataset", "ImportReport", "Segment", "SequenceInfo", "SequenceWriter", "Source",

@@ -4,10 +4,11 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.frames import Frame, Sequence, frame_images, gbuffers_of
+from essjax.frames import RANGE_CHANNELS, Frame, SampleRanges, Sequence, frame_images, gbuffers_of
 
 _AXES = {"horizontal": 0, "vertical": 1}
 _MIRRORED = {"motion": 2, "normal": 3, "world_position": 3}
@@ -59,7 +60,7 @@ def start_with_cut(sequence: Sequence) -> Sequence:
 
 
 def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:
-    """Cut a window out of all frames, and the matching one out of the reference; native frames are dropped.
+    """Cut a window out of all frames, the matching one out of reference and ranges; native frames are dropped.
 
     The principal point moves with the window; pixels whose previous position leaves the window become holes in
     ``valid``.
@@ -86,11 +87,16 @@ def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Se
     valid, steady = (
         None if mask is None else _window(mask, top, left, height, width) for mask in (sequence.valid, sequence.steady)
     )
+
+    def enlarged(image: Any) -> Any:
+        return _window(image, scale * top, scale * left, scale * height, scale * width)
+
     return Sequence(
         frames=cropped,
-        reference=_window(sequence.reference, scale * top, scale * left, scale * height, scale * width),
+        reference=enlarged(sequence.reference),
         valid=None if valid is None else valid * _stays_inside(cropped),
         steady=steady,
+        ranges=None if sequence.ranges is None else jax.tree.map(enlarged, sequence.ranges),
     )
 
 
@@ -107,24 +113,29 @@ def _flip_camera(camera: Camera, component: int, size: int) -> Camera:
 
 
 def _flip_frame(frame: Frame, component: int) -> Frame:
-    axis = -2 if component == 0 else -3
-
-    def transform(name: str, image: np.ndarray) -> np.ndarray:
-        flipped = np.flip(image, axis)
-        if name in _MIRRORED:
-            sign = np.ones(_MIRRORED[name], image.dtype)
-            sign[component] = -1
-            flipped = flipped * sign
-        return flipped
-
     sign = np.ones(2, np.float32)
     sign[component] = -1
-    size = frame.motion.shape[axis]
+    size = frame.motion.shape[-2 if component == 0 else -3]
     return dataclasses.replace(
-        _map_images(frame, transform),
+        _map_images(frame, lambda name, image: _mirror(name, image, component)),
         jitter=frame.jitter * sign,
         camera=None if frame.camera is None else _flip_camera(frame.camera, component, size),
     )
+
+
+def _flip_ranges(ranges: SampleRanges, component: int) -> SampleRanges:
+    images = {name: np.asarray(getattr(ranges, name)) for name in RANGE_CHANNELS}
+    return SampleRanges(**{name: _mirror(name, image, component) for name, image in images.items()})
+
+
+def _mirror(name: str, image: np.ndarray, component: int) -> np.ndarray:
+    """Flip an image, and the sign of that component where it is a vector."""
+    flipped = np.flip(image, -2 if component == 0 else -3)
+    if name not in _MIRRORED:
+        return flipped
+    sign = np.ones(_MIRRORED[name], image.dtype)
+    sign[component] = -1
+    return flipped * sign
 
 
 def flip(sequence: Sequence, direction: str) -> Sequence:
@@ -150,5 +161,6 @@ def flip(sequence: Sequence, direction: str) -> Sequence:
         frames=_flip_frame(sequence.frames, component),
         reference=np.flip(sequence.reference, axis),
         native=None if sequence.native is None else _flip_frame(sequence.native, component),
+        ranges=None if sequence.ranges is None else _flip_ranges(sequence.ranges, component),
         **{name: None if mask is None else np.flip(mask, axis) for name, mask in masks.items()},
     )

@@ -16,8 +16,10 @@ from typing import NamedTuple
 import numpy as np
 import OpenEXR
 
-FULL_PRECISION = frozenset({"depth", "world_position", "motion"})
+FULL_PRECISION = frozenset({"depth", "depth_min", "depth_max", "world_position", "motion"})
 """Layers kept in float32: half resolves 64 px of motion to 1/16 px and 1 km of depth to 0.5 m."""
+DEPTHS = frozenset({"depth", "depth_min", "depth_max"})
+"""Layers that may be +inf: background."""
 HALF_MAX = 65504.0
 SMALL_IMAGE = 512 << 20
 """A file may always declare this many bytes of pixels ..."""
@@ -217,7 +219,7 @@ def _encode(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, int]
     low, high = values.min(), values.max()  # NaN if there is one
     if np.isfinite(low) and np.isfinite(high) and max(-low, high) <= HALF_MAX:  # nearly always: nothing to look for
         return np.ascontiguousarray(values, np.float32 if layer(name) in FULL_PRECISION else np.float16), 0
-    allowed = np.isfinite(values) | ((values == np.inf) & (layer(name) == "depth"))
+    allowed = np.isfinite(values) | ((values == np.inf) & (layer(name) in DEPTHS))
     if not allowed.all():
         raise ValueError(
             f"{path}, channel {name}: expected finite values, got {values[~allowed][0]} in {int((~allowed).sum())} "

@@ -5,6 +5,7 @@
     OUT/<sequence>/lr.NNNN.exr      color.R, normal.X, depth.Z, motion.X, ...: the frame and its masks
     OUT/<sequence>/hr.NNNN.exr      R, G, B: the reference
     OUT/<sequence>/native.NNNN.exr  optional: the frame again at the reference's size, with a jitter of its own
+    OUT/<sequence>/ranges.NNNN.exr  optional: depth_min.Z, color_max.R, ...: over all samples of each reference pixel
 
 Frames keep their original numbers; ranges of frames include both ends. Colours, normals and the like are half, depth,
 positions and motion float32, ids integers.
@@ -28,6 +29,17 @@ SUFFIXES = {
     "valid": "Y", "steady": "Y",
 }  # fmt: skip
 """Channel suffixes of every image of an ``lr`` or ``native`` file."""
+RANGE_SUFFIXES = {
+    "depth_min": "Z", "depth_max": "Z", "color_min": "RGB", "color_max": "RGB", "normal_spread": "Y",
+    "normal_spread_smooth": "Y", "motion": "XY",
+}  # fmt: skip
+"""The same of a ``ranges`` file."""
+KINDS = ("lr", "hr", "native", "ranges")
+"""Kinds of files that a frame may consist of."""
+
+
+AGREE = ("width", "height", "scale", "channels", "native", "ranges")
+"""Fields of ``SequenceInfo`` in which all frames of a dataset agree."""
 
 
 class Segment(NamedTuple):
@@ -57,6 +69,7 @@ class SequenceInfo:
       scale: reference size over frame size.
       channels: the images in every ``lr`` file, as in ``SUFFIXES``.
       native: whether there are ``native`` files.
+      ranges: whether there are ``ranges`` files.
       source: where the frames come from, as the producer describes it.
       frames: one record per complete frame, in order: ``number``, ``jitter``, ``cut``, ``exposure``, ``camera``
         (``camera_to_world``, ``focal``, ``center``, or None), ``notes`` (counts); ``native_jitter`` and
@@ -73,6 +86,7 @@ class SequenceInfo:
     source: Mapping[str, Any]
     frames: tuple[Mapping[str, Any], ...] = ()
     complete: bool = False
+    ranges: bool = False
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -87,7 +101,7 @@ class Dataset:
     Attributes:
       path: the folder.
       source: where the data comes from, as the producer describes it.
-      sequences: name -> ``SequenceInfo``; all agree in size, scale, channels and native.
+      sequences: name -> ``SequenceInfo``; all agree in size, scale, channels, native and ranges.
       splits: "train", "validation", "test" -> segments.
     """
 
@@ -98,7 +112,7 @@ class Dataset:
 
     @property
     def info(self) -> SequenceInfo:
-        """The first sequence: size, scale, channels and native are those of all."""
+        """The first sequence: size, scale, channels, native and ranges are those of all."""
         return next(iter(self.sequences.values()))
 
     def segments(self, split: str) -> tuple[Segment, ...]:
@@ -119,11 +133,11 @@ class Dataset:
 
 def channel_names(image: str) -> list[str]:
     """``["normal.X", "normal.Y", "normal.Z"]`` of ``"normal"``."""
-    return [f"{image}.{suffix}" for suffix in SUFFIXES[image]]
+    return [f"{image}.{suffix}" for suffix in {**RANGE_SUFFIXES, **SUFFIXES}[image]]
 
 
 def frame_path(root: Path, name: str, kind: str, number: int) -> Path:
-    """File of one frame; ``kind`` is "lr", "hr" or "native"."""
+    """File of one frame; ``kind`` is one of ``KINDS``."""
     return Path(root) / name / f"{kind}.{number:04d}.exr"
 
 
@@ -174,6 +188,7 @@ def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
     """
     path = Path(root) / name / "sequence.json"
     content = _schema(path, read_json(path))
+    content.setdefault("ranges", False)  # datasets older than ranges
     fields = [field.name for field in dataclasses.fields(SequenceInfo)]
     missing = [field for field in fields if field not in content]
     if missing:
@@ -213,7 +228,7 @@ def _check_agreement(path: Path, infos: Iterable[SequenceInfo]) -> None:
                 f"{path}: sequence {info.name} is unfinished ({len(info.frames)} frames so far). "
                 "Run the command that writes it again: it resumes."
             )
-        for field in ("width", "height", "scale", "channels", "native"):
+        for field in AGREE:
             if getattr(info, field) != getattr(infos[0], field):
                 raise ValueError(
                     f"{path}: all sequences must agree in {field}: {infos[0].name} has {getattr(infos[0], field)}, "
@@ -259,6 +274,7 @@ def write_dataset(
             "scale": info.scale,
             "channels": list(info.channels),
             "native": info.native,
+            "ranges": info.ranges,
             "sequences": list(sequences),
             "splits": {split: [segment._asdict() for segment in segments] for split, segments in resolved.items()},
         },

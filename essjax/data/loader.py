@@ -3,6 +3,7 @@
 import dataclasses
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Protocol
 
 import grain
@@ -12,7 +13,7 @@ import numpy as np
 from essjax.data.augment import crop as crop_sequence
 from essjax.data.augment import flip, start_with_cut
 from essjax.data.layout import Dataset
-from essjax.data.store import read_segment
+from essjax.data.read import read_segment
 from essjax.frames import Sequence, select_time
 
 
@@ -49,11 +50,10 @@ class CachedSource:
             return self._cache[index]
 
 
-def disk_source(dataset: Dataset, split: str, *, native: bool = False) -> CachedSource:
+def disk_source(dataset: Dataset, split: str, *, native: bool = False, ranges: bool = False) -> CachedSource:
     """The segments of a split, read when first used; ``dataset.segments(split)`` says which frames are scored."""
-    return CachedSource(
-        [lambda segment=segment: read_segment(dataset, segment, native=native) for segment in dataset.segments(split)]
-    )
+    read = partial(read_segment, dataset, native=native, ranges=ranges)
+    return CachedSource([partial(read, segment) for segment in dataset.segments(split)])
 
 
 def windows(source: Source, length: int) -> list[tuple[int, int]]:

@@ -1,10 +1,9 @@
-"""``Sequence``s to and from a dataset folder, frame by frame."""
+"""``Sequence``s to a dataset folder, frame by frame."""
 
 import dataclasses
 import json
 import os
-from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,23 +13,27 @@ import OpenEXR
 
 from essjax.cameras import Camera
 from essjax.data import exr
-from essjax.data.augment import start_with_cut
 from essjax.data.layout import (
+    AGREE,
+    KINDS,
     SUFFIXES,
-    Dataset,
-    Segment,
     SequenceInfo,
-    channel_names,
     frame_path,
     read_sequence_info,
     split_planes,
-    stack_planes,
-    whole,
     write_sequence_info,
 )
-from essjax.frames import Frame, Sequence, frame_images, gbuffers_of, select_time, validate_frame
+from essjax.frames import (
+    RANGE_CHANNELS,
+    Frame,
+    SampleRanges,
+    Sequence,
+    frame_images,
+    select_time,
+    validate_frame,
+    validate_ranges,
+)
 
-MASKS = ("valid", "steady")
 FAST = {"compression": OpenEXR.RLE_COMPRESSION}
 """For imports, which ZIP would dominate: lossless in a third of its time, for a quarter more disk (path-traced)."""
 
@@ -66,6 +69,14 @@ def _planes(images: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {
         key: plane for name, image in images.items() for key, plane in split_planes(name, np.asarray(image)).items()
     }
+
+
+class _Extra(NamedTuple):
+    """What a frame may have beside its images and its reference."""
+
+    masks: Mapping[str, Any] = {}
+    native: Frame | None = None
+    ranges: SampleRanges | None = None
 
 
 class PreparedFrame(NamedTuple):
@@ -125,7 +136,7 @@ class SequenceWriter:
         """Whether the sequence is finished."""
         return self.info is not None and self.info.complete
 
-    def _describe(self, frame: Frame, reference: Any, masks: Mapping, native: Frame | None) -> SequenceInfo:
+    def _describe(self, frame: Frame, reference: Any, extra: _Extra) -> SequenceInfo:
         height, width = frame.motion.shape[-3:-1]
         scale = reference.shape[0] // height
         if reference.shape != (scale * height, scale * width, 3) or scale < 1:
@@ -133,18 +144,21 @@ class SequenceWriter:
                 f"sequence {self.name}, reference: expected [s*{height}, s*{width}, 3] with a whole s, "
                 f"got {tuple(reference.shape)}."
             )
+        native, ranges = extra.native, extra.ranges
         if native is not None and native.motion.shape != (*reference.shape[:2], 2):
             raise ValueError(
                 f"sequence {self.name}, native frames: expected the reference's size {reference.shape[:2]}, "
                 f"got {tuple(native.motion.shape[:2])}."
             )
-        present = {**frame_images(frame), **masks}
+        present = {**frame_images(frame), **extra.masks}
         channels = tuple(name for name in SUFFIXES if name in present)
-        return SequenceInfo(self.name, width, height, scale, channels, native is not None, self.source)
+        return SequenceInfo(
+            self.name, width, height, scale, channels, native is not None, self.source, ranges=ranges is not None
+        )
 
     def _check_next(self, number: int, described: SequenceInfo, cut: bool) -> SequenceInfo:
         info = self.info or described
-        for field in ("width", "height", "scale", "channels", "native"):
+        for field in AGREE:
             if getattr(info, field) != getattr(described, field):
                 raise ValueError(
                     f"sequence {self.name}, frame {number}: {field} changes from {getattr(info, field)} to "
@@ -166,6 +180,7 @@ class SequenceWriter:
         valid: Any = None,
         steady: Any = None,
         native: Frame | None = None,
+        ranges: SampleRanges | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
         """Write one frame; nothing happens if it is already complete.
@@ -177,6 +192,7 @@ class SequenceWriter:
           valid: ``[H, W, 1]`` or None.
           steady: ``[H, W, 1]`` or None.
           native: leaves ``[s*H, s*W, C]`` or None.
+          ranges: leaves ``[s*H, s*W, C]`` or None.
           notes: numbers about this frame to keep in its record; ``clamped``, the count of values beyond half's range
             that were clamped, is added.
 
@@ -186,10 +202,11 @@ class SequenceWriter:
         if number in self:
             return
         masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
-        frame, reference, native = jax.tree.map(np.asarray, (frame, reference, native))
-        self._validate(number, frame, reference, native)
-        self._check_next(number, self._describe(frame, reference, masks, native), bool(frame.cut))
-        self.commit(self._write_images(number, frame, reference, masks, native, notes or {}, {}))
+        extra = _Extra(masks, native, ranges)
+        frame, reference, extra = jax.tree.map(np.asarray, (frame, reference, extra))
+        self._validate(number, frame, reference, extra)
+        self._check_next(number, self._describe(frame, reference, extra), bool(frame.cut))
+        self.commit(self._write_images(number, frame, reference, extra, notes or {}, {}))
 
     def prepare(
         self, number: int, frame: Frame, reference: Any, *, notes: Mapping[str, Any] | None = None
@@ -200,8 +217,8 @@ class SequenceWriter:
           ValueError: invalid content.
         """
         frame, reference = jax.tree.map(np.asarray, (frame, reference))
-        self._validate(number, frame, reference, None)
-        return self._write_images(number, frame, reference, {}, None, notes or {}, FAST)
+        self._validate(number, frame, reference, _Extra())
+        return self._write_images(number, frame, reference, _Extra(), notes or {}, FAST)
 
     def commit(self, prepared: PreparedFrame, *, cut: bool = False, save: bool = True) -> None:
         """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
@@ -231,14 +248,16 @@ class SequenceWriter:
 
     def discard(self, number: int) -> None:
         """Remove the images of a frame that is not listed."""
-        for kind in ("lr", "hr", "native"):
+        for kind in KINDS:
             self._path(kind, number).unlink(missing_ok=True)
 
-    def _validate(self, number: int, frame: Frame, reference: np.ndarray, native: Frame | None) -> None:
+    def _validate(self, number: int, frame: Frame, reference: np.ndarray, extra: _Extra) -> None:
         where = f"sequence {self.name}, frame {number}"
         validate_frame(frame, where, ("color",))
-        if native is not None:
-            validate_frame(native, f"{where}, native", ("color",))
+        if extra.native is not None:
+            validate_frame(extra.native, f"{where}, native", ("color",))
+        if extra.ranges is not None:
+            validate_ranges(extra.ranges, reference.shape[0], reference.shape[1], f"{where}, ranges")
         if not (np.isfinite(reference).all() and reference.min() >= 0):
             raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
 
@@ -247,19 +266,24 @@ class SequenceWriter:
         number: int,
         frame: Frame,
         reference: np.ndarray,
-        masks: Mapping,
-        native: Frame | None,
+        extra: _Extra,
         notes: Mapping,
         attributes: Mapping,
     ) -> PreparedFrame:
-        described = self._describe(frame, reference, masks, native)
+        described = self._describe(frame, reference, extra)
         (self.root / self.name).mkdir(parents=True, exist_ok=True)
-        clamped = exr.write(self._path("lr", number), _planes({**frame_images(frame), **masks}), attributes=attributes)
-        hr = {name: reference[..., i] for i, name in enumerate("RGB")}
-        clamped += exr.write(self._path("hr", number), hr, attributes=attributes)
-        if native is not None:
-            clamped += exr.write(self._path("native", number), _planes(frame_images(native)), attributes=attributes)
-        record = _plain({**_frame_record(number, frame, native), "notes": {**notes, "clamped": clamped}})
+        files = {
+            "lr": _planes({**frame_images(frame), **extra.masks}),
+            "hr": {name: reference[..., i] for i, name in enumerate("RGB")},
+        }
+        if extra.native is not None:
+            files["native"] = _planes(frame_images(extra.native))
+        if extra.ranges is not None:
+            files["ranges"] = _planes({name: getattr(extra.ranges, name) for name in RANGE_CHANNELS})
+        clamped = sum(
+            exr.write(self._path(kind, number), planes, attributes=attributes) for kind, planes in files.items()
+        )
+        record = _plain({**_frame_record(number, frame, extra.native), "notes": {**notes, "clamped": clamped}})
         return PreparedFrame(number, described, record)
 
     def _path(self, kind: str, number: int) -> Path:
@@ -296,104 +320,6 @@ def write_sequence(
     sequence = jax.tree.map(np.asarray, sequence)
     for index in range(sequence.frames.motion.shape[0]):
         at: Sequence = select_time(sequence, index)
-        writer.write(first + index, at.frames, at.reference, valid=at.valid, steady=at.steady, native=at.native)
+        extra = {name: getattr(at, name) for name in ("valid", "steady", "native", "ranges")}
+        writer.write(first + index, at.frames, at.reference, **extra)
     return writer.finish()
-
-
-def _sized(path: Path, channels: dict[str, np.ndarray], width: int, height: int) -> dict[str, np.ndarray]:
-    for name, plane in channels.items():
-        if plane.shape != (height, width):
-            raise ValueError(
-                f"{path}, channel {name}: expected {width}x{height} as sequence.json says, "
-                f"got {plane.shape[1]}x{plane.shape[0]}."
-            )
-    return channels
-
-
-def _read_images(path: Path, names: Iterable[str], width: int, height: int) -> dict[str, np.ndarray]:
-    names = list(names)
-    expected = [channel for name in names for channel in channel_names(name)]
-    planes = _sized(path, exr.read(path, expected), width, height)
-    return {name: stack_planes(planes, name) for name in names}
-
-
-def _make_camera(record: Mapping | None) -> Camera | None:
-    return None if record is None else Camera(**{key: np.asarray(value, np.float32) for key, value in record.items()})
-
-
-def _make_frame(images: Mapping[str, np.ndarray], record: Mapping, prefix: str = "") -> Frame:
-    return Frame(
-        color=images["color"],
-        gbuffers=gbuffers_of(images),
-        motion=images["motion"],
-        jitter=np.asarray(record[f"{prefix}jitter"], np.float32),
-        cut=np.asarray(record["cut"], bool),
-        exposure=np.asarray(record["exposure"], np.float32),
-        camera=_make_camera(record[f"{prefix}camera"]),
-        reactive=images.get("reactive"),
-    )
-
-
-def _read_frame(root: Path, info: SequenceInfo, record: Mapping, native: bool) -> Sequence:
-    number, wide, high = record["number"], info.width * info.scale, info.height * info.scale
-    try:
-        images = _read_images(frame_path(root, info.name, "lr", number), info.channels, info.width, info.height)
-        path = frame_path(root, info.name, "hr", number)
-        reference = _sized(path, exr.read(path, "RGB"), wide, high)
-        native_frame = None
-        if native:
-            names = [name for name in info.channels if name not in MASKS]
-            native_images = _read_images(frame_path(root, info.name, "native", number), names, wide, high)
-            native_frame = _make_frame(native_images, record, "native_")
-        return Sequence(
-            frames=_make_frame(images, record),
-            reference=np.stack([reference[name] for name in "RGB"], axis=-1).astype(np.float32),
-            valid=images.get("valid"),
-            steady=images.get("steady"),
-            native=native_frame,
-        )
-    except KeyError as error:
-        raise ValueError(f"{root / info.name / 'sequence.json'}, frame {number}: {error} is missing.") from error
-    except ValueError as error:
-        raise ValueError(f"dataset {root}, sequence {info.name}, frame {number}: {error}") from error
-
-
-def read_sequence(
-    dataset: Dataset,
-    name: str,
-    frames: tuple[int, int] | None = None,
-    *,
-    native: bool = True,
-    threads: int | None = None,
-) -> Sequence:
-    """Read a sequence into memory: NumPy leaves ``[T, H, W, C]``, float32 (``stencil`` int32, ``cut`` bool).
-
-    Args:
-      dataset: from ``read_dataset``.
-      name: of the sequence.
-      frames: numbers of the first and the last frame, both included; None: all. The first frame read becomes a
-        cut (``start_with_cut``), for what came before it is not there.
-      native: read the native frames too, where there are any.
-      threads: files read at the same time; None: one per core.
-
-    Raises:
-      ValueError: names dataset, sequence, frame, file and channel, what was expected and what came.
-    """
-    if name not in dataset.sequences:
-        raise ValueError(f"{dataset.path}: no sequence {name!r}; there are {', '.join(dataset.sequences)}.")
-    info = dataset.sequences[name]
-    first, last = frames or whole(info)[1:3]
-    records = [record for record in info.frames if first <= record["number"] <= last]
-    if not records or first not in info.numbers or last not in info.numbers:
-        raise ValueError(
-            f"{dataset.path}, sequence {name}: expected a range within the frames {info.numbers[0]}.."
-            f"{info.numbers[-1]}, got {first}..{last}."
-        )
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        parts = list(pool.map(lambda r: _read_frame(dataset.path, info, r, native and info.native), records))
-    return start_with_cut(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
-
-
-def read_segment(dataset: Dataset, segment: Segment, *, native: bool = True) -> Sequence:
-    """``read_sequence`` of a segment, warm-up frames included."""
-    return read_sequence(dataset, segment.sequence, (segment.first, segment.last), native=native)

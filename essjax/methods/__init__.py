@@ -3,12 +3,13 @@
 from essjax.methods.baselines import bicubic, bilinear, gaussian_blur, jau, jau_image, warp
 from essjax.methods.dlctus import dlctus
 from essjax.methods.extrass import extrass, extrass_e, extrass_w
+from essjax.methods.fasset import fasset
 from essjax.methods.ifrnet import ifrnet
 from essjax.methods.interpolation import bsr, warp_3d
 from essjax.methods.nsrr import nsrr
 from essjax.methods.taau import gaussian_resample, taa, taau, taau_half
 
 __all__ = [
-    "bicubic", "bilinear", "bsr", "dlctus", "extrass", "extrass_e", "extrass_w", "gaussian_blur", "gaussian_resample",
-    "ifrnet", "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "warp", "warp_3d",
+    "bicubic", "bilinear", "bsr", "dlctus", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur",
+    "gaussian_resample", "ifrnet", "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "warp", "warp_3d",
 ]  # fmt: skip

@@ -2,14 +2,9 @@
 
 from essjax.networks.dlctus import dlctus_network
 from essjax.networks.extrassnet import extrassnet
+from essjax.networks.fasset import fasset
 from essjax.networks.frnet import frnet
 from essjax.networks.ifrnet import ifrnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = [
-    "dlctus_network",
-    "extrassnet",
-    "frnet",
-    "ifrnet",
-    "nsrr",
-]
+__all__ = ["dlctus_network", "extrassnet", "fasset", "frnet", "ifrnet", "nsrr"]

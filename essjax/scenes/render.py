@@ -130,14 +130,19 @@ def buffers(
 
 
 @jax.jit
-def normals_and_depth(world: World, x: Array, y: Array, angle: Array) -> tuple[Array, Array, Array]:
-    """Normal with and without bump detail ``[N, 3]`` (0 where nothing is hit) and depth ``[N, 1]``."""
+def surfaces(world: World, previous: World, x: Array, y: Array, angle: Array) -> dict[str, Float[Array, "N C"]]:
+    """Of every sample: normal with and without bump detail (0 where nothing is hit), depth, motion in image widths."""
     origin, direction, cosine = primary_rays(world, x, y)
     t, row = geometry.trace(world, origin, direction, jnp.full_like(x, geometry.FAR))
     s = surface(world, row, origin, direction, t, t * angle)
     hit = s.hit[:, None]
-    normals = [jnp.where(hit, stack(normal), 0.0) for normal in (s.normal, s.smooth_normal)]
-    return normals[0], normals[1], jnp.where(hit, (t * cosine)[:, None], jnp.inf)
+    previous_x, previous_y = screen_position(previous, _follow(previous, s, direction)[1])
+    return {
+        "normal": jnp.where(hit, stack(s.normal), 0.0),
+        "smooth_normal": jnp.where(hit, stack(s.smooth_normal), 0.0),
+        "depth": jnp.where(hit, (t * cosine)[:, None], jnp.inf),
+        "motion": jnp.stack([previous_x - x, previous_y - y], axis=-1),
+    }
 
 
 def screen_grid(width: int, height: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -253,21 +258,29 @@ def _erode(mask: np.ndarray) -> np.ndarray:
     return np.min([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
 
 
-def render_statistics(world: World, width: int, height: int, *, spp: int = 64) -> dict[str, np.ndarray]:
-    """What ``sequence.subsample_statistics`` returns, images ``[H, W, C]``."""
-    world = jax.device_put(world)
+def render_statistics(
+    world: World, previous: World, width: int, height: int, *, spp: int = 64
+) -> dict[str, np.ndarray]:
+    """Images ``[H, W, C]`` of what ``sequence.subsample_statistics`` returns, and the same samples' ``reference``."""
+    world, previous = jax.device_put((world, previous))
     offsets = (reference_samples(spp) - 0.5) / width
     angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
 
     def ranges(x, y):
         places = _spread(x, y, offsets, rays)
-        results = (color_along(world, *places, angle), *normals_and_depth(world, *places, angle))
-        color, normal, smooth, depth = (np.asarray(r)[: x.size * spp].reshape(spp, x.size, -1) for r in results)
+        samples = {"color": color_along(world, *places, angle), **surfaces(world, previous, *places, angle)}
+        samples = {name: s[: x.size * spp].reshape(spp, x.size, -1) for name, s in samples.items()}
+        reference = samples["color"].mean(axis=0)
+        samples = jax.device_get(samples)
+        color, depth = samples["color"], samples["depth"]
         distance = lambda n: np.abs(n - n[:1]).sum(axis=-1, keepdims=True).max(axis=0)
+        nearest = np.broadcast_to(depth.argmin(axis=0)[None], (1, x.size, 2))
         return {
             "depth_min": depth.min(axis=0), "depth_max": depth.max(axis=0),
             "color_min": color.min(axis=0), "color_max": color.max(axis=0),
-            "normal_spread": distance(normal), "normal_spread_smooth": distance(smooth),
+            "normal_spread": distance(samples["normal"]), "normal_spread_smooth": distance(samples["smooth_normal"]),
+            "motion": np.take_along_axis(samples["motion"], nearest, axis=0)[0] * np.float32(width),
+            "reference": reference,
         }  # fmt: skip
 
     x, y = screen_grid(width, height, np.zeros(2))

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.frames import Frame, Sequence, gbuffers_of
+from essjax.frames import RANGE_CHANNELS, Frame, SampleRanges, Sequence, gbuffers_of
 from essjax.scenes.builder import Scene
 from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
@@ -48,7 +48,7 @@ def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray
 
 def render_frame(
     scene: Scene, index: int, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
-    mip_bias: float = 0.0, jitter: str = "halton",
+    ranges: bool = False, mip_bias: float = 0.0, jitter: str = "halton",
 ) -> Sequence:  # fmt: skip
     """One frame of ``scene`` as a ``Sequence`` without time axis (leaves ``[H, W, C]``), NumPy arrays.
 
@@ -62,6 +62,7 @@ def render_frame(
       scale: reference size over frame size.
       spp: samples per reference pixel.
       native: also render 1-sample frames at the reference's size; their jitter advances every frame.
+      ranges: also the ranges over the reference's samples, see ``subsample_statistics``.
       mip_bias: texture filter of LR and native frames, log2 of its width over an output pixel's: 0 is what
         upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
         Eq 47 of thesis 002, -log2(f) - log2(spp) / 2 over an *input* pixel, is ``-log2(spp) / 2`` here: 0 for its
@@ -77,14 +78,26 @@ def render_frame(
     wide, high = width * scale, height * scale
     angle = pixel_angle(world, wide, mip_bias)
     native_frame = None
+
+    def from_samples() -> tuple[np.ndarray, SampleRanges | None]:
+        if not ranges:
+            return render_reference(world, wide, high, spp=spp), None
+        images = render_statistics(world, scene.before(index), wide, high, spp=spp)
+        return images["reference"], _ranges(images)
+
     # Beside the buffers, so that the two compilations of the first frame run at the same time.
     with ThreadPoolExecutor(1) as beside:
-        reference = beside.submit(render_reference, world, wide, high, spp=spp)
+        sampled = beside.submit(from_samples)
         frame, valid, steady = _frame(scene, index, width, height, offset, angle)
         if native:
             offset = jitter_sequence(index + 1, every_frame=True)[index]
             native_frame, _, _ = _frame(scene, index, wide, high, offset, angle)
-    return Sequence(frames=frame, reference=reference.result(), valid=valid, steady=steady, native=native_frame)
+    reference, found = sampled.result()
+    return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame, ranges=found)
+
+
+def _ranges(images: dict[str, np.ndarray]) -> SampleRanges:
+    return SampleRanges(**{name: images[name] for name in RANGE_CHANNELS})
 
 
 def iterate_frames(
@@ -100,7 +113,8 @@ def iterate_frames(
 
 def render_sequence(
     scene: Scene, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
-    mip_bias: float = 0.0, jitter: str = "halton", on_frame: Callable[[int], None] | None = None,
+    ranges: bool = False, mip_bias: float = 0.0, jitter: str = "halton",
+    on_frame: Callable[[int], None] | None = None,
 ) -> Sequence:  # fmt: skip
     """All frames of ``scene``: a ``Sequence`` whose leaves are ``[T, H, W, C]`` float32 NumPy arrays.
 
@@ -111,19 +125,20 @@ def render_sequence(
       scale: see ``render_frame``.
       spp: see ``render_frame``.
       native: see ``render_frame``.
+      ranges: see ``render_frame``.
       mip_bias: see ``render_frame``.
       jitter: see ``render_frame``.
       on_frame: called with the index of each finished frame (progress bars).
     """
     parts, settings = [], {"scale": scale, "spp": spp, "native": native, "mip_bias": mip_bias, "jitter": jitter}
-    for index, part in iterate_frames(scene, width, height, **settings):
+    for index, part in iterate_frames(scene, width, height, ranges=ranges, **settings):
         parts.append(part)
         if on_frame is not None:
             on_frame(index)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
 
 
-def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, spp: int = 64) -> dict[str, np.ndarray]:
+def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, spp: int = 64) -> SampleRanges:
     """Ranges over the samples of each output pixel: what classifier labels are made of (Guo et al. 2022, section 2).
 
     Args:
@@ -134,9 +149,7 @@ def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, s
       spp: samples per pixel, those of the reference.
 
     Returns:
-      ``depth_min``, ``depth_max`` ``[H, W, 1]`` (metres, +inf background), ``color_min``, ``color_max`` ``[H, W, 3]``,
-      ``normal_spread``, ``normal_spread_smooth`` ``[H, W, 1]``: largest L1 distance of a sample's normal to the first
-      sample's, with and without bump detail (the background's normal is 0).
+      NumPy leaves ``[H, W, C]``; the background's normal counts as 0.
     """
     _check_size(width, height, 1, spp)
-    return render_statistics(scene.at(index), width, height, spp=spp)
+    return _ranges(render_statistics(scene.at(index), scene.before(index), width, height, spp=spp))

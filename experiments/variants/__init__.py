@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, extrass, interpolation, nsrr
+from experiments.variants import baselines, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
     **nsrr.VARIANTS,
     **interpolation.VARIANTS,
+    **fasset.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""

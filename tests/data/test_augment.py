@@ -9,7 +9,7 @@ import pytest
 from essjax.cameras import Camera, pixel_positions, project, static_motion, unproject
 from essjax.data import crop, flip
 from essjax.frames import Frame, GBuffers, Sequence, validate_sequence
-from tests.helpers import random_camera
+from tests.helpers import make_ranges, random_camera
 
 H, W, T, SCALE = 9, 14, 3, 2
 
@@ -151,3 +151,20 @@ def test_a_frame_without_a_camera_or_masks():
     result = crop(flip(bare, "horizontal"), 1, 1, 3, 3)
     assert result.frames.camera is None and result.valid is None and result.frames.motion.shape == (T, 3, 3, 2)
     assert isinstance(scene().frames.camera, Camera)
+
+
+def with_ranges() -> Sequence:
+    ranges = jax.tree.map(np.asarray, make_ranges(5, T, SCALE * H, SCALE * W))
+    return dataclasses.replace(scene(), ranges=ranges)
+
+
+def test_ranges_are_cut_and_mirrored_with_the_reference():
+    original = with_ranges()
+    cropped = crop(original, 3, 5, 4, 7)
+    np.testing.assert_array_equal(cropped.ranges.color_min, original.ranges.color_min[:, 6:14, 10:24])
+    np.testing.assert_array_equal(cropped.ranges.motion, original.ranges.motion[:, 6:14, 10:24])
+    for direction, axis, sign in (("horizontal", 2, [-1, 1]), ("vertical", 1, [1, -1])):
+        flipped = flip(original, direction)
+        np.testing.assert_array_equal(flipped.ranges.motion, np.flip(original.ranges.motion, axis) * sign)
+        np.testing.assert_array_equal(flipped.ranges.depth_max, np.flip(original.ranges.depth_max, axis))
+        validate_sequence(flip(cropped, direction), "cropped")

@@ -10,6 +10,7 @@ import pytest
 from essjax.data import (
     Segment,
     SequenceWriter,
+    disk_source,
     exr,
     read_dataset,
     read_segment,
@@ -38,7 +39,8 @@ def assert_close(actual, expected):
 def write_frames(writer, source, numbers, first):
     for number in numbers:
         at = select_time(source, number - first)
-        writer.write(number, at.frames, at.reference, valid=at.valid, steady=at.steady, native=at.native)
+        extra = {name: getattr(at, name) for name in ("valid", "steady", "native", "ranges")}
+        writer.write(number, at.frames, at.reference, **extra)
 
 
 @pytest.mark.parametrize("native", [False, True])
@@ -54,6 +56,34 @@ def test_round_trip(tmp_path, native, scale):
     validate_sequence(back, "a")
     assert {leaf.dtype for leaf in jax.tree.leaves(back)} == {np.dtype(t) for t in (np.float32, np.int32, bool)}
     assert read_sequence(dataset, "a", native=False).native is None
+
+
+def test_ranges_come_back_on_request(tmp_path):
+    written = sequence(ranges=True)
+    write_sequence(tmp_path, "a", written, first=8)
+    dataset = write_dataset(tmp_path, {"train": ["a"]})
+    assert dataset.info.ranges and read_dataset(tmp_path).info.ranges
+    assert read_sequence(dataset, "a").ranges is None
+    back = disk_source(dataset, "train", ranges=True)[0]
+    assert_close(back, written)
+    for name in ("depth_min", "depth_max", "motion"):
+        np.testing.assert_array_equal(getattr(back.ranges, name), getattr(written.ranges, name))
+    (tmp_path / "a" / "ranges.0009.exr").unlink()
+    with pytest.raises(ValueError, match=r"sequence a, frame 9: .*ranges\.0009\.exr: expected an EXR file"):
+        read_sequence(dataset, "a", ranges=True)
+
+
+def test_without_ranges_there_are_none(tmp_path):
+    write_sequence(tmp_path, "a", sequence())
+    path = tmp_path / "a" / "sequence.json"
+    content = json.loads(path.read_text())
+    assert content.pop("ranges") is False
+    path.write_text(json.dumps(content))  # as written before there were ranges
+    assert read_sequence(write_dataset(tmp_path, {"train": ["a"]}), "a", ranges=True).ranges is None
+    writer = SequenceWriter(tmp_path, "b")
+    write_frames(writer, sequence(ranges=True), [0], 0)
+    with pytest.raises(ValueError, match="sequence b, frame 1: ranges changes from True to False"):
+        write_frames(writer, sequence(), [1], 0)
 
 
 def test_absent_buffers_stay_absent(tmp_path):

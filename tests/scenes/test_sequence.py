@@ -124,15 +124,31 @@ def test_reference_converges():
 
 def test_statistics_bound_the_reference_and_bumps_add_spread():
     scene = scenes.make_scene("texture", 1, 2)
-    stats = scenes.subsample_statistics(scene, 1, *SIZE, spp=16)
-    reference = render.render_reference(scene.at(1), *SIZE, spp=16)
-    assert (stats["color_min"] <= reference + 1e-4).all() and (reference <= stats["color_max"] + 1e-4).all()
-    assert (stats["depth_min"] <= stats["depth_max"]).all()
-    assert stats["normal_spread"].shape == (20, 36, 1)
-    flat = stats["normal_spread_smooth"] == 0
-    assert flat.mean() > 0.2 and stats["normal_spread"][flat].mean() > 0.01
-    edge = (stats["depth_max"] - stats["depth_min"]) / stats["depth_max"] > 0.2
-    assert edge.any() and stats["normal_spread_smooth"][edge].mean() > stats["normal_spread_smooth"].mean()
+    frame = scenes.render_frame(scene, 1, *SIZE, scale=1, spp=16, ranges=True)
+    stats, reference = frame.ranges, render.render_reference(scene.at(1), *SIZE, spp=16)
+    leaves_equal(stats, scenes.subsample_statistics(scene, 1, *SIZE, spp=16))
+    np.testing.assert_array_equal(frame.reference, reference)
+    frames.validate_ranges(stats, 20, 36)
+    assert (stats.color_min <= reference + 1e-4).all() and (reference <= stats.color_max + 1e-4).all()
+    assert stats.normal_spread.shape == (20, 36, 1)
+    flat = stats.normal_spread_smooth == 0
+    assert flat.mean() > 0.2 and stats.normal_spread[flat].mean() > 0.01
+    edge = (stats.depth_max - stats.depth_min) / stats.depth_max > 0.2
+    assert edge.any() and stats.normal_spread_smooth[edge].mean() > stats.normal_spread_smooth.mean()
+
+
+def test_motion_of_the_nearest_sample():
+    """Inside surfaces that of the frame's one sample; at silhouettes it belongs to the foreground."""
+    scene = scenes.make_scene("carousel", 3, 4)
+    frame = scenes.render_frame(scene, 3, *SIZE, scale=1, spp=16, ranges=True)
+    stats = frame.ranges
+    smooth = np.isfinite(stats.depth_max) & (stats.depth_max < 1.02 * stats.depth_min)
+    difference = np.linalg.norm(stats.motion - frame.frames.motion, axis=-1, keepdims=True)
+    assert np.median(np.linalg.norm(frame.frames.motion, axis=-1)) > 0.3 and smooth.mean() > 0.4
+    assert np.median(difference[smooth]) < 0.02 and np.quantile(difference[smooth], 0.95) < 0.2
+    # A sample that lies behind the nearest by far sees another surface, with a motion of its own.
+    behind = frame.frames.gbuffers.depth > 1.2 * stats.depth_min
+    assert behind.sum() > 5 and np.median(difference[behind]) > 0.1
 
 
 def gain(family, seed, index):

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from essjax.data.layout import Dataset, SequenceInfo
-from essjax.data.store import read_sequence
+from essjax.data.read import read_sequence
 from essjax.frames import Frame, Sequence, frame_images, select_time
 
 
