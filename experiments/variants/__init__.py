@@ -17,11 +17,6 @@ VARIANTS: dict[str, Variant] = {
 
 BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "taau-half", "taau", "taa")
 """Rows of every table."""
-REFERENCES = {
-    "taau": "gets every frame rendered: twice the input",
-    "taa": "gets every frame rendered at native resolution: eight times the input",
-}
-"""Rows that are not on equal terms, and why."""
 
 
 def get_variant(name: str) -> Variant:
