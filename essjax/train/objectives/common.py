@@ -66,7 +66,7 @@ def last_prediction(method: Method, variables: PyTree, frames: Frame, schedule: 
       schedule: must render the last frame.
     """
     length = frames.motion.shape[0]
-    frames = dataclasses.replace(frames, cut=frames.cut.at[0].set(True))
+    frames = dataclasses.replace(frames, cut=jnp.asarray(frames.cut).at[0].set(True))
     before = select_time(frames, slice(0, length - 1))
     history = unroll(method, variables, before, Schedule(schedule.kinds, 1, length), train=True).history
     return method.render_step(variables, history, select_time(frames, length - 1), train=True)[1]

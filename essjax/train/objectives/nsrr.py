@@ -31,7 +31,8 @@ def nsrr_objective(method: Method, *, vgg_weight: float = 0.1, vgg_features: Cal
         prediction = last_prediction(method, variables, clip.frames, every())
         reference = clip.reference[-1]
         # Not clipped to [0, 1]: where it is, no gradient would lead back.
-        terms = {"dissimilarity": jnp.mean(1.0 - ssim_map(prediction.aux["display_image"], display(reference)))}
+        similarity = ssim_map(prediction.aux["display_image"], display(reference))
+        terms: dict[str, Array] = {"dissimilarity": jnp.mean(1.0 - similarity)}
         if vgg_features is not None:
             terms["vgg"] = vgg_weight * sum_of_means(perceptual(prediction.image, reference, vgg_features))
         return terms, prediction.state
