@@ -7,9 +7,9 @@ from essjax.methods.fasset import fasset
 from essjax.methods.ifrnet import ifrnet
 from essjax.methods.interpolation import bsr, warp_3d
 from essjax.methods.nsrr import nsrr
-from essjax.methods.taau import gaussian_resample, taa, taau, taau_half
+from essjax.methods.taau import taa, taau, taau_half, tus
 
 __all__ = [
-    "bicubic", "bilinear", "bsr", "dlctus", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur",
-    "gaussian_resample", "ifrnet", "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "warp", "warp_3d",
+    "bicubic", "bilinear", "bsr", "dlctus", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur", "ifrnet",
+    "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "tus", "warp", "warp_3d",
 ]  # fmt: skip

@@ -5,6 +5,7 @@ from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, train
 from essjax.train.objectives import (
     Objective,
     both_kinds,
+    dlctus_objective,
     extrass_objective,
     fasset_objective,
     frnet_objective,
@@ -17,6 +18,6 @@ from essjax.train.step import make_train_step
 
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds", "constant",
-    "cosine", "create_state", "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective",
-    "learning_rate", "make_train_step", "nsrr_objective", "odd_length", "optimizer", "train",
+    "cosine", "create_state", "dlctus_objective", "extrass_objective", "fasset_objective", "frnet_objective", "halving",
+    "ifrnet_objective", "learning_rate", "make_train_step", "nsrr_objective", "odd_length", "optimizer", "train",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, extrass, fasset, interpolation, nsrr
+from experiments.variants import baselines, dlctus, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
@@ -11,6 +11,7 @@ VARIANTS: dict[str, Variant] = {
     **nsrr.VARIANTS,
     **interpolation.VARIANTS,
     **fasset.VARIANTS,
+    **dlctus.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""
