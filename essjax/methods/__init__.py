@@ -1,7 +1,10 @@
 """Methods: each a factory that returns a ``Method``, two pure steps over a history (``essjax.interfaces``)."""
 
 from essjax.methods.baselines import bicubic, bilinear, gaussian_blur, jau, jau_image, warp
+from essjax.methods.composed import composed, settled, with_taa
 from essjax.methods.dlctus import dlctus
+from essjax.methods.extranet import extranet
+from essjax.methods.extranet import from_torch as extranet_from_torch
 from essjax.methods.extrass import extrass, extrass_e, extrass_w
 from essjax.methods.fasset import fasset
 from essjax.methods.ifrnet import ifrnet
@@ -10,6 +13,7 @@ from essjax.methods.nsrr import nsrr
 from essjax.methods.taau import taa, taau, taau_half, tus
 
 __all__ = [
-    "bicubic", "bilinear", "bsr", "dlctus", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur", "ifrnet",
-    "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "tus", "warp", "warp_3d",
+    "bicubic", "bilinear", "bsr", "composed", "dlctus", "extranet", "extranet_from_torch", "extrass", "extrass_e",
+    "extrass_w", "fasset", "gaussian_blur", "ifrnet", "jau", "jau_image", "nsrr", "settled", "taa", "taau", "taau_half",
+    "tus", "warp", "warp_3d", "with_taa",
 ]  # fmt: skip

@@ -3,15 +3,16 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, dlctus, extrass, fasset, interpolation, nsrr
+from experiments.variants import baselines, dlctus, extranet, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
-    **nsrr.VARIANTS,
-    **interpolation.VARIANTS,
+    **extranet.VARIANTS,
     **fasset.VARIANTS,
     **dlctus.VARIANTS,
+    **nsrr.VARIANTS,
+    **interpolation.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""

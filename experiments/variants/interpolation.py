@@ -12,6 +12,10 @@ def _ifrnet(config: Config) -> Method:
     return methods.ifrnet(width=config.width)
 
 
+def _ifrnet_taa(config: Config) -> Method:
+    return methods.with_taa(_ifrnet(config))
+
+
 def _stages(config: Config) -> list[Stage]:
     method = _ifrnet(config)
     objective = ifrnet_objective(method, ifrnet(config.width), feature_weight=config.feature_weight)
@@ -23,6 +27,7 @@ VARIANTS = {
         "IFRNet: interpolation by learned optical flow, without G-buffers, low resolution (+1 frame of latency)",
         _ifrnet,
         _stages,
+        parts=("ifrnet+taa",),
         presets={
             "smoke": {"clip": 3, "feature_weight": 0.01},
             "quick": {
@@ -34,6 +39,11 @@ VARIANTS = {
                 "steps": 300 * 300,
             },
         },
+    ),
+    "ifrnet+taa": Variant(
+        "IFRNet at native resolution, then temporal anti-aliasing: half of the frames rendered, all pixels (+1 frame)",
+        _ifrnet_taa,
+        weights="ifrnet",
     ),
     "bsr": Variant(
         "bidirectional scene reprojection, interpolates at low resolution (+1 frame of latency)",

@@ -104,6 +104,7 @@ def test_list_names_all_variants(capsys):
         ("taau", "gets every frame rendered: twice the input"),
         ("taa", "gets every frame rendered at native resolution: eight times the input"),
         ("nsrr", "gets every frame rendered: twice the input"),
+        ("extranet+taa", "gets rendered frames at native resolution: four times the input"),
         ("bsr", "+1 frame of latency: it interpolates; frames without a later one are not scored"),
     ],
 )

@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from essjax.frames import Frame, Prediction, Sequence, select_time
+from essjax.frames import Frame, Prediction, Sequence, select_time, without_color
 from essjax.interfaces import Method
 from essjax.rollout import ESS, SS, Schedule, alternate, unroll
 from essjax.typing import Array, Callable, PyTree
@@ -54,19 +54,43 @@ def odd_length(clip: Sequence) -> Sequence:
     return clip if length % 2 else select_time(clip, slice(0, length - 1))
 
 
-def last_prediction(method: Method, variables: PyTree, frames: Frame, schedule: Schedule) -> Prediction:
-    """What the step of the last of ``frames`` returns, for losses on it alone; its state is a dict also without one.
+def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Schedule | None = None) -> Prediction:
+    """What the step of the last frame of a clip returns (``train=True``), from the history that the schedule gives it.
 
-    The steps before it are not scanned: of them only what the history holds is computed and differentiated.
+    For losses on that frame alone. Of the steps before it only what the history needs is computed and differentiated.
 
     Args:
       method: the two steps.
-      variables: from ``method.init``.
-      frames: leaves ``[T, ...]``; frame 0 counts as the first of a shot.
-      schedule: must render the last frame.
+      variables: its variables.
+      frames: ``[T, ...]``, T >= 2.
+      schedule: of the clip; None: the alternation that extrapolates the last frame.
+
+    Raises:
+      ValueError: there are fewer than two frames.
     """
     length = frames.motion.shape[0]
-    frames = dataclasses.replace(frames, cut=jnp.asarray(frames.cut).at[0].set(True))
-    before = select_time(frames, slice(0, length - 1))
-    history = unroll(method, variables, before, Schedule(schedule.kinds, 1, length), train=True).history
-    return method.render_step(variables, history, select_time(frames, length - 1), train=True)[1]
+    if length < 2:
+        raise ValueError(f"clip: expected at least 2 frames, the last to predict and one before it, got {length}.")
+    schedule = alternate(length % 2) if schedule is None else schedule
+    kinds, (_, period, lead) = schedule.kinds(length), schedule
+
+    def step(history: PyTree, frame: Frame, kind: str, train: bool = False) -> tuple[PyTree, Prediction]:
+        if kind == SS:
+            return method.render_step(variables, history, frame, train=train)
+        return method.extrapolate_step(variables, history, without_color(frame), train=train)
+
+    def several(history: PyTree, chunk: Frame) -> tuple[PyTree, None]:
+        for k in range(period):
+            history, _ = step(history, select_time(chunk, k), kinds[lead + k])
+        return history, None
+
+    lead = min(lead, length - 1)
+    scanned = (length - 1 - lead) // period
+    body_end, history = lead + scanned * period, method.start(select_time(frames, 0))
+    for n in range(lead):
+        history, _ = step(history, select_time(frames, n), kinds[n])
+    body = jax.tree.map(lambda leaf: leaf[lead:body_end].reshape(scanned, period, *leaf.shape[1:]), frames)
+    history, _ = jax.lax.scan(several, history, body)
+    for n in range(body_end, length - 1):
+        history, _ = step(history, select_time(frames, n), kinds[n])
+    return step(history, select_time(frames, length - 1), kinds[-1], train=True)[1]

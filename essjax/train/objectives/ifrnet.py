@@ -8,7 +8,7 @@ from essjax.frames import Sequence, rendered_color, select_time
 from essjax.interfaces import Method, Network
 from essjax.losses import census, charbonnier, feature_census, sum_of_means
 from essjax.rollout import alternate
-from essjax.train.objectives.common import Objective, last_prediction
+from essjax.train.objectives.common import Objective, predict_last
 from essjax.typing import Array, PyTree
 
 
@@ -26,7 +26,7 @@ def ifrnet_objective(method: Method, network: Network, *, feature_weight: float 
         if length < 3:
             raise ValueError(f"clip: expected at least 3 frames (two rendered ones around a third), got {length}.")
         frames = select_time(clip.frames, slice(-3, None))
-        prediction = last_prediction(method, variables, frames, alternate(0))
+        prediction = predict_last(method, variables, frames, alternate(0))
         predicted = prediction.aux
         target = log1p(rendered_color(frames, "ifrnet")[1])
         # The target's features are given, as in ``frnet_objective``.

@@ -8,7 +8,7 @@ from essjax.interfaces import Method
 from essjax.losses import perceptual, ssim_map, sum_of_means
 from essjax.networks.nsrr import PREVIOUS
 from essjax.rollout import every
-from essjax.train.objectives.common import Objective, last_prediction
+from essjax.train.objectives.common import Objective, predict_last
 from essjax.typing import Array, Callable, PyTree
 
 VGG_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
@@ -28,7 +28,7 @@ def nsrr_objective(method: Method, *, vgg_weight: float = 0.1, vgg_features: Cal
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         clip = select_time(clip, slice(-(PREVIOUS + 1), None))
-        prediction = last_prediction(method, variables, clip.frames, every())
+        prediction = predict_last(method, variables, clip.frames, every())
         reference = clip.reference[-1]
         # Not clipped to [0, 1]: where it is, no gradient would lead back.
         similarity = ssim_map(prediction.aux["display_image"], display(reference))
