@@ -1,10 +1,10 @@
 """VGG-16 features from torchvision-layout weights, in plain ``lax`` convolutions.
 
 The weights are the user's: a file with the entries ``features.N.weight`` (OIHW) and ``features.N.bias`` of
-torchvision's ``vgg16``, as ``.safetensors`` or ``.npz``. Entries of layers above the last one asked for may be absent.
+torchvision's ``vgg16``, in a format of ``tensors.read_tensors``. Entries of layers above the last one asked for may be
+absent.
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.color import display
+from essjax.tensors import read_tensors
 from essjax.typing import Array, Callable, Color, Image
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -29,8 +30,6 @@ _CONVOLUTIONS = {
 LAYERS = tuple(f"relu{block}_{conv}" for block, conv in _CONVOLUTIONS)
 """Names of the layers that may be asked for, from the image up."""
 
-_SAFETENSORS_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2"}
-
 
 def vgg16_features(
     weights_path: str | Path, *, layers: tuple[str, ...] = ("relu2_2",)
@@ -41,7 +40,7 @@ def vgg16_features(
     default layer is the one of Johnson et al. 2016's feature reconstruction loss, whom ExtraSS eq 12 cites.
 
     Args:
-      weights_path: torchvision-layout weights, ``.safetensors`` or ``.npz``.
+      weights_path: torchvision-layout weights, see ``tensors.read_tensors``.
       layers: names from ``LAYERS``; only what lies below the highest of them is loaded and computed.
 
     Returns:
@@ -55,7 +54,7 @@ def vgg16_features(
     unknown = [name for name in layers if name not in LAYERS]
     if unknown or not layers:
         raise ValueError(f"layers: expected names from {', '.join(LAYERS)}; got {', '.join(unknown) or 'none'}.")
-    tensors = _read_tensors(Path(weights_path))
+    tensors = read_tensors(weights_path, "VGG-16 weights", prefix="features.")
     needed = list(_CONVOLUTIONS.items())[: 1 + max(LAYERS.index(name) for name in layers)]
     parameters = {
         f"relu{block}_{conv}": _convolution(tensors, index, inputs, outputs, weights_path)
@@ -66,42 +65,6 @@ def vgg16_features(
         return _activations(parameters, image, layers)
 
     return jax.tree_util.Partial(apply, parameters)
-
-
-def _read_tensors(path: Path) -> Mapping[str, np.ndarray]:
-    if not path.is_file():
-        raise ValueError(f"VGG-16 weights: expected a .safetensors or .npz file, got {path}, which does not exist.")
-    readers = {".npz": _read_npz, ".safetensors": _read_safetensors}
-    if path.suffix not in readers:
-        raise ValueError(
-            f"VGG-16 weights: expected a .safetensors or .npz file, got {path.name}. "
-            "Save torchvision's vgg16().state_dict() as one of them."
-        )
-    try:
-        return readers[path.suffix](path)
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"VGG-16 weights: {path} is damaged or not a {path.suffix} file ({error}).") from error
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files if name.startswith("features.")}
-
-
-def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
-    """The format is a JSON header and raw arrays: these lines are less than a dependency for one optional file."""
-    data = path.read_bytes()
-    header_end = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:header_end])
-    tensors = {}
-    for name, entry in header.items():
-        if name.startswith("features."):
-            if entry["dtype"] not in _SAFETENSORS_DTYPES:
-                raise ValueError(f"{name} has dtype {entry['dtype']}, expected F32, F16 or F64")
-            begin, end = entry["data_offsets"]
-            raw = data[header_end + begin : header_end + end]
-            tensors[name] = np.frombuffer(raw, _SAFETENSORS_DTYPES[entry["dtype"]]).reshape(entry["shape"])
-    return tensors
 
 
 def _convolution(

@@ -1,9 +1,10 @@
 """Flax modules behind ``Network(init, apply)``; the only package that imports flax."""
 
 from essjax.networks.dlctus import dlctus_network
+from essjax.networks.extranet import extranet
 from essjax.networks.extrassnet import extrassnet
 from essjax.networks.fasset import fasset
 from essjax.networks.frnet import frnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = ["dlctus_network", "extrassnet", "fasset", "frnet", "nsrr"]
+__all__ = ["dlctus_network", "extranet", "extrassnet", "fasset", "frnet", "nsrr"]

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
-Padding = tuple[tuple[int, int], tuple[int, int]]
+Padding = tuple[tuple[int, int], ...]
+"""(before, behind) of rows and of columns."""
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))

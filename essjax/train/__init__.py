@@ -6,16 +6,19 @@ from essjax.train.objectives import (
     Objective,
     both_kinds,
     dlctus_objective,
+    extranet_objective,
     extrass_objective,
     fasset_objective,
     frnet_objective,
     odd_length,
+    predict_last,
 )
 from essjax.train.state import TrainState, constant, cosine, create_state, halving, learning_rate, optimizer
 from essjax.train.step import make_train_step
 
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds", "constant",
-    "cosine", "create_state", "dlctus_objective", "extrass_objective", "fasset_objective", "frnet_objective",
-    "halving", "learning_rate", "make_train_step", "odd_length", "optimizer", "train",
+    "cosine", "create_state", "dlctus_objective", "extranet_objective", "extrass_objective", "fasset_objective",
+    "frnet_objective", "halving", "learning_rate", "make_train_step", "odd_length", "optimizer", "predict_last",
+    "train",
 ]  # fmt: skip

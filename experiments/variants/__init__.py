@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, dlctus, extrass, fasset
+from experiments.variants import baselines, dlctus, extranet, extrass, fasset
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
+    **extranet.VARIANTS,
     **fasset.VARIANTS,
     **dlctus.VARIANTS,
     **baselines.VARIANTS,
@@ -19,6 +20,7 @@ BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "ta
 EVERY_FRAME = "gets every frame rendered: twice the input"
 REFERENCES = {
     **dict.fromkeys(("taau", "tus", *dlctus.VARIANTS), EVERY_FRAME),
+    "extranet+taa": "works at native resolution: four times the input",
     "taa": "gets every frame rendered at native resolution: eight times the input",
 }
 """Rows that are not on equal terms, and why."""

@@ -137,9 +137,9 @@ def test_messages(npz, tmp_path):
         ValueError, match=r"features.5.weight in .*: expected shape \(128, 64, 3, 3\), got \(128, 64, 5, 5\)"
     ):
         vgg16_features(wrong)
-    other = tmp_path / "vgg16.pth"
+    other = tmp_path / "vgg16.onnx"
     other.write_bytes(b"0")
-    with pytest.raises(ValueError, match="expected a .safetensors or .npz file, got vgg16.pth"):
+    with pytest.raises(ValueError, match="VGG-16 weights: expected a file that ends in .safetensors, .npz.*vgg16.onnx"):
         vgg16_features(other)
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(save_safetensors(tmp_path / "x.safetensors", weights()).read_bytes()[:5000])

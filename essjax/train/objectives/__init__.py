@@ -1,11 +1,12 @@
 """What each stage minimises: ``Objective = (variables, clip) -> ({term: weighted scalar}, statistics)``."""
 
-from essjax.train.objectives.common import Objective, both_kinds, odd_length
+from essjax.train.objectives.common import Objective, both_kinds, odd_length, predict_last
 from essjax.train.objectives.dlctus import dlctus_objective
+from essjax.train.objectives.extranet import extranet_objective
 from essjax.train.objectives.extrass import extrass_objective, frnet_objective
 from essjax.train.objectives.fasset import fasset_objective
 
 __all__ = [
-    "Objective", "both_kinds", "dlctus_objective", "extrass_objective", "fasset_objective", "frnet_objective",
-    "odd_length",
+    "Objective", "both_kinds", "dlctus_objective", "extranet_objective", "extrass_objective", "fasset_objective",
+    "frnet_objective", "odd_length", "predict_last",
 ]  # fmt: skip

@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from essjax.frames import Sequence, select_time
+from essjax.frames import Frame, Prediction, Sequence, select_time, without_color
 from essjax.interfaces import Method
 from essjax.rollout import ESS, SS, alternate, unroll
 from essjax.typing import Array, Callable, PyTree
@@ -52,3 +52,37 @@ def odd_length(clip: Sequence) -> Sequence:
     """``clip`` without its last frame if their number is even: what ``both_kinds`` takes."""
     length = clip.frames.motion.shape[0]
     return clip if length % 2 else select_time(clip, slice(0, length - 1))
+
+
+def predict_last(method: Method, variables: PyTree, frames: Frame) -> Prediction:
+    """Extrapolate the last frame of a clip (``train=True``) from the history that the alternation gives it.
+
+    For methods whose history holds rendered frames only: no gradient flows through it. What is predicted on the way is
+    not computed, because nothing reads it.
+
+    Args:
+      method: extrapolates.
+      variables: its variables.
+      frames: ``[T, ...]``, T >= 2.
+
+    Raises:
+      ValueError: there are fewer than two frames.
+    """
+    length = frames.motion.shape[0]
+    if length < 2:
+        raise ValueError(f"clip: expected at least 2 frames, one to extrapolate from, got {length}.")
+
+    def render(history: PyTree, frame: Frame) -> PyTree:
+        return method.render_step(variables, history, frame)[0]
+
+    def pair(history: PyTree, chunk: Frame) -> tuple[PyTree, None]:
+        history = render(history, select_time(chunk, 0))
+        return method.extrapolate_step(variables, history, without_color(select_time(chunk, 1)))[0], None
+
+    history = method.start(select_time(frames, 0))
+    if length % 2:  # the alternation that ends with an extrapolated frame starts with a warm-up
+        history, frames = render(history, select_time(frames, 0)), select_time(frames, slice(1, length))
+    pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, 2, *leaf.shape[1:]), frames)
+    history, _ = jax.lax.scan(pair, history, select_time(pairs, slice(0, -1)))
+    history = render(history, select_time(frames, -2))
+    return method.extrapolate_step(variables, history, without_color(select_time(frames, -1)), train=True)[1]

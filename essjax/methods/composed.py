@@ -1,0 +1,114 @@
+"""Two methods in a row: the first makes a colour for every frame, the second takes all of them for rendered.
+
+ExtraSS Table 3 feeds extrapolating methods at output resolution and smooths what comes out: ``extranet_taa``.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from essjax.frames import Frame, Prediction, without_color
+from essjax.interfaces import Method, MethodInfo, Step, no_variables
+from essjax.methods.extranet import extranet
+from essjax.methods.taau import taa
+from essjax.typing import Callable, Color
+
+
+def _with_color(frame: Frame, color: Color) -> Frame:
+    return dataclasses.replace(frame, color=color)
+
+
+def composed(
+    name: str,
+    first: Method,
+    second: Method,
+    *,
+    native: bool = False,
+    between: Callable[[Frame, Color], Frame] = _with_color,
+) -> Method:
+    """``second.render_step`` on every image of ``first``.
+
+    ``variables`` are those of both, side by side. ``aux`` is the second's, and the first's prediction as ``"first"``.
+    Where the first lags behind (interpolation), the second sees the frame that the image belongs to.
+
+    Args:
+      name: of the whole.
+      first: makes the colours.
+      second: sees no frame without colour.
+      native: both work on frames of the reference's resolution.
+      between: ``(frame, the first's image) -> frame`` for the second; replace it where sizes change on the way.
+
+    Raises:
+      ValueError: ``first`` lags by more than one frame.
+    """
+    if first.info.latency > 1:
+        raise ValueError(f"{name}: expected a first method that lags by at most 1 frame, got {first.info.latency}.")
+    late = bool(first.info.latency)
+
+    def blank(example: Frame) -> Frame:
+        *lead, height, width, _ = example.motion.shape
+        size = (*lead, round(height * first.info.scale), round(width * first.info.scale), 3)
+        return between(example, jnp.zeros(size, jnp.float32))
+
+    def init(key, example):
+        keys = jax.random.split(key)
+        return {**first.init(keys[0], example), **second.init(keys[1], blank(example))}
+
+    def start(example):
+        history = {"first": first.start(example), "second": second.start(blank(example))}
+        # A copy: a streaming step donates its history.
+        return {**history, "frame": jax.tree.map(jnp.copy, without_color(example))} if late else history
+
+    def after(step: Step) -> Step:
+        def run(variables, history, frame, *, train=False):
+            earlier, made = step(variables, history["first"], frame, train=train)
+            shown = between(history["frame"] if late else frame, made.image)
+            later, result = second.render_step(variables, history["second"], shown, train=train)
+            history = {"first": earlier, "second": later}
+            history = {**history, "frame": without_color(frame)} if late else history
+            aux = {**result.aux, "first": made}
+            return history, Prediction(image=result.image, aux=aux, state={**made.state, **result.state})
+
+        return run
+
+    info = MethodInfo(
+        name,
+        scale=first.info.scale * second.info.scale,
+        latency=first.info.latency + second.info.latency,
+        requires=first.info.requires | second.info.requires,
+        native=native,
+        renders_all=first.info.renders_all,
+    )
+    return Method(init, start, after(first.render_step), after(first.extrapolate_step), info)
+
+
+def settled(method: Method) -> Method:
+    """``method`` with the variables that its ``init`` gives, as constants: a heuristic with its default settings."""
+
+    def with_own(step: Step) -> Step:
+        def run(variables, history, frame, *, train=False):
+            return step(method.init(jax.random.key(0), frame), history, frame, train=train)
+
+        return run
+
+    return method._replace(
+        init=no_variables,
+        render_step=with_own(method.render_step),
+        extrapolate_step=with_own(method.extrapolate_step),
+    )
+
+
+def extranet_taa(*, alpha: float = 0.5, sigma: float = 0.5, history: bool = True, occlusion: bool = True) -> Method:
+    """ExtraNet on native-resolution frames, then temporal anti-aliasing of every frame (ExtraSS Table 3).
+
+    ``variables`` are ``extranet``'s. Extrapolated frames carry the jitter of their own G-buffers, as rendered ones do.
+
+    Args:
+      alpha: see ``taa``.
+      sigma: see ``taa``.
+      history: see ``extranet``.
+      occlusion: see ``extranet``.
+    """
+    first = extranet(history=history, occlusion=occlusion)
+    return composed("extranet+taa", first, settled(taa(alpha=alpha, sigma=sigma)), native=True)

@@ -1,0 +1,155 @@
+"""Named arrays from weight files that others trained: NumPy's ``.npz``, ``.safetensors``, PyTorch's ``.pth``.
+
+PyTorch's format is a pickle in a zip file. It is read without PyTorch and without running what the pickle names: only
+what rebuilds tensors is let through.
+"""
+
+import collections
+import json
+import math
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SUFFIXES = (".safetensors", ".npz", ".pth", ".pt", ".pth.tar", ".pkl")
+"""Endings of the files that ``read_tensors`` takes; all but the first two are PyTorch's."""
+
+_SAFETENSORS_DTYPES = {
+    "F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "<u2",
+    "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "<i1", "U8": "<u1", "BOOL": "<?",
+}  # fmt: skip
+_STORAGES = {
+    "DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "BFloat16Storage": "<u2",
+    "LongStorage": "<i8", "IntStorage": "<i4", "ShortStorage": "<i2", "CharStorage": "<i1", "ByteStorage": "<u1",
+    "BoolStorage": "<?",
+}  # fmt: skip
+
+
+def read_tensors(path: str | Path, what: str = "weights", *, prefix: str = "") -> dict[str, np.ndarray]:
+    """The arrays of a weight file by name.
+
+    A PyTorch file may hold a state dict or a checkpoint with one under ``state_dict``. bfloat16 becomes float32.
+
+    Args:
+      path: its ending says what it is, see ``SUFFIXES``.
+      what: what the file should be, for messages.
+      prefix: names that start otherwise are left out.
+
+    Raises:
+      ValueError: there is no such file, its ending is unknown, it is damaged, or it names code to run.
+    """
+    path = Path(path)
+    suffix = next((s for s in SUFFIXES if path.name.endswith(s)), None)
+    if not path.is_file() or suffix is None:
+        got = f"{path}, which does not exist" if suffix else path.name
+        raise ValueError(f"{what}: expected a file that ends in {', '.join(SUFFIXES)}; got {got}.")
+    reader = {".npz": _read_npz, ".safetensors": _read_safetensors}.get(suffix, _read_torch)
+    try:
+        return reader(path, prefix)
+    except _ERRORS as error:
+        raise ValueError(f"{what}: {path} is damaged or not a {suffix} file ({error}).") from error
+
+
+def _read_npz(path: Path, prefix: str) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files if name.startswith(prefix)}
+
+
+def _float32(bits: np.ndarray) -> np.ndarray:
+    """bfloat16 is the upper half of a float32."""
+    return (bits.astype("<u4") << 16).view("<f4")
+
+
+def _read_safetensors(path: Path, prefix: str) -> dict[str, np.ndarray]:
+    """The format is a JSON header and raw arrays: these lines are less than a dependency."""
+    data = path.read_bytes()
+    header_end = 8 + int.from_bytes(data[:8], "little")
+    tensors = {}
+    for name, entry in json.loads(data[8:header_end]).items():
+        if name.startswith(prefix) and name != "__metadata__":
+            if entry["dtype"] not in _SAFETENSORS_DTYPES:
+                raise ValueError(f"{name} has dtype {entry['dtype']}, expected {', '.join(_SAFETENSORS_DTYPES)}")
+            begin, end = entry["data_offsets"]
+            raw = data[header_end + begin : header_end + end]
+            array = np.frombuffer(raw, _SAFETENSORS_DTYPES[entry["dtype"]]).reshape(entry["shape"])
+            tensors[name] = _float32(array) if entry["dtype"] == "BF16" else array
+    return tensors
+
+
+def _read_torch(path: Path, prefix: str) -> dict[str, np.ndarray]:
+    if not zipfile.is_zipfile(path):
+        raise ValueError("not a zip file; files older than PyTorch 1.6 must be saved again by a newer one")
+    with zipfile.ZipFile(path) as archive:
+        pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
+        if len(pickles) != 1:
+            raise ValueError(f"expected one data.pkl in it, found {len(pickles)}")
+        folder = pickles[0].removesuffix("data.pkl")
+        if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":
+            raise ValueError("big-endian storages are not supported")
+        with archive.open(pickles[0]) as file:
+            content = _Unpickler(file, archive, folder).load()
+    if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
+        content = content["state_dict"]
+    if not isinstance(content, Mapping):
+        raise ValueError(f"expected a state dict, got a {type(content).__name__}")
+    return {
+        name: tensor
+        for name, tensor in content.items()
+        if isinstance(name, str) and isinstance(tensor, np.ndarray) and name.startswith(prefix)
+    }
+
+
+def _rebuild_tensor(storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_) -> np.ndarray:
+    """A strided view of a storage, copied. Its bounds are checked: a file must not read other memory."""
+    size, stride = tuple(map(int, size)), tuple(map(int, stride))
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if math.prod(size) and not (min((offset, *size, *stride)) >= 0 and last < storage.size):
+        raise ValueError(f"a tensor of size {size} and stride {stride} at {offset} leaves its storage")
+    steps = [step * storage.itemsize for step in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
+
+
+def _rebuild_parameter(tensor: np.ndarray, *_) -> np.ndarray:
+    return tensor
+
+
+class _Unpickler(pickle.Unpickler):
+    """Lets a pickle call nothing but what builds dictionaries and tensors."""
+
+    ALLOWED = {
+        ("collections", "OrderedDict"): collections.OrderedDict,
+        ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
+        ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
+        **{("torch", name): name for name in _STORAGES},
+    }
+
+    def __init__(self, file: Any, archive: zipfile.ZipFile, folder: str):
+        super().__init__(file)
+        self._archive, self._folder = archive, folder
+
+    def find_class(self, module_name: str, global_name: str) -> Any:
+        """What a name in the pickle stands for."""
+        if (module_name, global_name) not in self.ALLOWED:
+            raise ValueError(f"it names {module_name}.{global_name}, which a state dict does not need: not loaded")
+        return self.ALLOWED[module_name, global_name]
+
+    def persistent_load(self, pid: Any) -> np.ndarray:
+        """A storage, from its own file in the archive."""
+        kind, storage, key, _, count = pid
+        if kind != "storage" or storage not in _STORAGES:
+            raise ValueError(f"unknown entry {kind} {storage}")
+        array = np.frombuffer(self._archive.read(f"{self._folder}data/{key}"), _STORAGES[storage])
+        if array.size != count:
+            raise ValueError(f"storage {key} holds {array.size} numbers, expected {count}")
+        return _float32(array) if storage == "BFloat16Storage" else array
+
+
+_ERRORS = (
+    OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, IndexError, pickle.UnpicklingError,
+    zipfile.BadZipFile,
+)  # fmt: skip
+"""What readers raise on damaged files."""

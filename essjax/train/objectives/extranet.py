@@ -1,0 +1,49 @@
+"""What ExtraNet's training minimises (section 4.5).
+
+Our reading, that of the published code: the losses compare the network's output with the demodulated frame, both
+log(1 + x), before base colour comes back. The frame is the jittered, aliased one.
+"""
+
+import jax.numpy as jnp
+
+from essjax.color import demodulate, log1p
+from essjax.frames import Sequence, rendered_color, select_time
+from essjax.interfaces import Method
+from essjax.losses import hardest, l1, masked_mean, occlusion
+from essjax.methods.extranet import WINDOW
+from essjax.methods.rendered import albedo
+from essjax.train.objectives.common import Objective, predict_last
+from essjax.typing import Array, PyTree
+
+
+def extranet_objective(
+    method: Method, *, hole_weight: float = 1.0, shade_weight: float = 1.0, share: float = 0.1
+) -> Objective:
+    """L of ExtraNet eq 7, on the last frame of each clip: L1 (eq 4), holes (eq 5), the worst pixels (eq 6).
+
+    A clip of ``WINDOW`` frames shows the network three rendered ones; of a longer one only the last frames are used.
+
+    Args:
+      method: ``extranet``.
+      hole_weight: lambda_hole of eq 7; eq 5's mask is the network's.
+      shade_weight: lambda_shade of eq 7; 0 leaves the term out (Table 7, "w/o L_shade").
+      share: k of eq 6 over the number of pixels.
+    """
+
+    def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
+        length = clip.frames.motion.shape[0]
+        frames = select_time(clip.frames, slice(max(length - WINDOW, 0), length))
+        prediction = predict_last(method, variables, frames)
+        last = select_time(frames, -1)
+        image = prediction.aux["log_shading"]
+        target = log1p(demodulate(rendered_color(last, "extranet"), albedo(last.gbuffers)))
+        errors, hole = l1(image, target), 1.0 - prediction.aux["inputs"].mask
+        terms = {
+            "l1": jnp.mean(errors),
+            "hole": hole_weight * masked_mean(occlusion(image, target, hole), hole),
+        }
+        if shade_weight:
+            terms["shade"] = shade_weight * masked_mean(errors, hardest(errors, share=share))
+        return terms, prediction.state
+
+    return objective
