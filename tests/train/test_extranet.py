@@ -13,7 +13,7 @@ from essjax.interfaces import Method, MethodInfo
 from essjax.methods import extranet
 from essjax.methods.extranet import Inputs
 from essjax.methods.rendered import albedo
-from essjax.train import create_state, extranet_objective, make_train_step, optimizer, predict_last
+from essjax.train import extranet_objective, predict_last
 from tests.helpers import make_sequence, random_image
 from tests.methods.scene import wall
 
@@ -57,7 +57,9 @@ def test_the_last_frame_is_predicted_from_the_alternation(length, kinds):
     log = np.asarray(prediction.aux["log"])
     np.testing.assert_array_equal(log[-length:], np.stack([np.arange(length), kinds], axis=-1))
     assert (log[:-length] == -1).all() and prediction.state["extranet"]["batch_stats"] is True
-    with pytest.raises(ValueError, match="clip: expected at least 2 frames, one to extrapolate from, got 1"):
+    with pytest.raises(
+        ValueError, match="clip: expected at least 2 frames, the last to predict and one before it, got 1"
+    ):
         predict_last(fake(SHADING, MASK), {"extranet": 1.0}, numbered(1).frames)
 
 
@@ -82,22 +84,34 @@ def test_terms_equal_numpy():
 
 
 def test_training_learns_how_the_light_moves():
-    """A resting wall under moving light: the warp alone shows the light of a frame ago."""
+    """A resting wall under moving light: the warp alone shows the light of a frame ago. Steps by sign, as Adam's first.
+
+    Without history encoder: it compiles in two thirds of the time.
+    """
     clip = wall(6, 4, 16, 16, light_speed=1.0)
     rough = jnp.ones_like(clip.frames.gbuffers.depth)
     gbuffers = dataclasses.replace(clip.frames.gbuffers, roughness=rough, metallic=0.0 * rough)
     clip = dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, gbuffers=gbuffers))
-    method, transform = extranet(), optimizer()
-    state = create_state(method.init(jax.random.key(0), select_time(clip.frames, 0)), "extranet", transform)
-    before = state.variables["extranet"]["batch_stats"]["conv1"]["BatchNorm_0"]
-    before = {name: np.asarray(value) for name, value in before.items()}
-    step = make_train_step(extranet_objective(method), transform, "extranet")
-    losses = []
+    method = extranet(history=False)
+    entry = jax.tree.map(np.asarray, method.init(jax.random.key(0), select_time(clip.frames, 0))["extranet"])
+    objective = extranet_objective(method)
+
+    @jax.jit
+    def evaluate(weights, statistics):
+        def loss(weights):
+            terms, state = objective({"extranet": {"params": weights, "batch_stats": statistics}}, clip)
+            return sum(terms.values()), state["extranet"]["batch_stats"]
+
+        return jax.value_and_grad(loss, has_aux=True)(weights)
+
+    weights, statistics, losses = entry["params"], entry["batch_stats"], []
     for _ in range(12):
-        state, terms = step(state, clip, 1e-2)
-        losses.append(float(terms["loss"]))
+        (loss, statistics), gradient = evaluate(weights, statistics)
+        assert jax.tree.structure(statistics) == jax.tree.structure(entry["batch_stats"])
+        weights = jax.tree.map(lambda weight, slope: weight - 3e-3 * np.sign(slope), weights, gradient)
+        losses.append(float(loss))
     last, previous = select_time(clip.frames, 5), select_time(clip.frames, 4)
     assert float(jnp.abs(log1p(last.color) - log1p(previous.color)).mean()) > 0.04  # there is something to learn
     assert losses[-1] < 0.6 * losses[0], losses
-    after = state.variables["extranet"]["batch_stats"]["conv1"]["BatchNorm_0"]
-    assert all(float(np.abs(np.asarray(after[name]) - before[name]).max()) > 1e-3 for name in before)
+    for before, after in zip(*map(jax.tree.leaves, (entry["batch_stats"], statistics)), strict=True):
+        assert float(np.abs(before - np.asarray(after)).max()) > 1e-3
