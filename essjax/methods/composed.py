@@ -99,7 +99,9 @@ def settled(method: Method) -> Method:
     )
 
 
-def extranet_taa(*, alpha: float = 0.5, sigma: float = 0.5, history: bool = True, occlusion: bool = True) -> Method:
+def extranet_taa(
+    *, alpha: float = 0.5, sigma: float = 0.5, history: bool = True, occlusion: bool = True, sky: bool = True
+) -> Method:
     """ExtraNet on native-resolution frames, then temporal anti-aliasing of every frame (ExtraSS Table 3).
 
     ``variables`` are ``extranet``'s. Extrapolated frames carry the jitter of their own G-buffers, as rendered ones do.
@@ -109,6 +111,7 @@ def extranet_taa(*, alpha: float = 0.5, sigma: float = 0.5, history: bool = True
       sigma: see ``taa``.
       history: see ``extranet``.
       occlusion: see ``extranet``.
+      sky: see ``extranet``.
     """
-    first = extranet(history=history, occlusion=occlusion)
+    first = extranet(history=history, occlusion=occlusion, sky=sky)
     return composed("extranet+taa", first, settled(taa(alpha=alpha, sigma=sigma)), native=True)
