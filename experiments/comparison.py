@@ -10,12 +10,12 @@ import jax
 from essjax.data import Dataset
 from essjax.frames import Sequence as FrameSequence
 from essjax.frames import frame_images, select_time
-from essjax.interfaces import Method
+from essjax.interfaces import Method, MethodInfo
 from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.evaluate import Clip, Runner
 from experiments.tuning import Setting, setting_variables, tune
-from experiments.variants import BASELINES, REFERENCES, VARIANTS, compared, stages_of, trained_as
+from experiments.variants import BASELINES, VARIANTS, compared, stages_of, trained_as
 
 
 class Trained(NamedTuple):
@@ -106,9 +106,31 @@ def _read_settings(path: Path) -> dict[str, Setting]:
     return {row: Setting(**setting) for row, setting in json.loads(path.read_text()).items()}
 
 
-def table_references() -> dict[str, str]:
-    """Rows that are not on equal terms, and why."""
-    return dict(REFERENCES)
+def table_references(runners: Mapping[str, Runner], scale: int) -> dict[str, str]:
+    """Rows that are not on equal terms with methods that extrapolate every other LR frame, and why."""
+    reasons = {row: unequal(runner.method.info, scale) for row, runner in runners.items()}
+    return {row: reason for row, reason in reasons.items() if reason}
+
+
+def unequal(info: MethodInfo, scale: int) -> str:
+    """What a method gets that others do not (more pixels, a later frame); an empty string if nothing.
+
+    Args:
+      info: of the method.
+      scale: reference size over frame size.
+    """
+    reasons = []
+    times = (2 if info.renders_all else 1) * (scale**2 if info.native else 1)
+    if times > 1:
+        frames = "every frame rendered" if info.renders_all else "rendered frames"
+        where = " at native resolution" if info.native else ""
+        reasons.append(f"gets {frames}{where}: {_TIMES.get(times, f'{times} times')} the input")
+    if info.latency:
+        reasons.append(f"+{info.latency} frame of latency: it interpolates; frames without a later one are not scored")
+    return "; ".join(reasons)
+
+
+_TIMES = {2: "twice", 4: "four times", 8: "eight times"}
 
 
 def _left_out(sequence: FrameSequence, config: Config) -> list[str]:

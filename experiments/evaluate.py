@@ -115,7 +115,7 @@ def _masked_psnr(images: Array, targets: Array, mask: Array) -> Array:
 
 
 def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str, ...]) -> list[dict[str, Any]]:
-    """One row per scored frame of a kind that the method predicts."""
+    """One row per scored frame of a kind that the method predicts; without those that it cannot show."""
     frames, scale = clip.sequence.frames, clip.sequence.scale
     low = images.shape[1:3] == frames.motion.shape[1:3] and not method.info.native
     foreground = ~np.asarray(background(frames.gbuffers))
@@ -143,8 +143,15 @@ def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str,
             **{name: float(values[n]) if np.isfinite(values[n]) else None for name, values in extra.items()},
         }
         for n in clip.scored
-        if kinds[n] in method.info.predicts
+        if kinds[n] in method.info.predicts and has_image(clip, n, method)
     ]
+
+
+def has_image(clip: Clip, n: int, method: Method) -> bool:
+    """Whether ``method`` shows frame ``n``: one that lags needs as many later frames of the same shot."""
+    late = method.info.latency
+    following = np.asarray(clip.sequence.frames.cut)[n + 1 : n + 1 + late]
+    return len(following) == late and not following.any()
 
 
 def picture_frames(clip: Clip, count: int) -> list[int]:
@@ -186,6 +193,8 @@ def evaluate(
                 curves[name][clip.name] += score_clip(runner.method, clip, images, kinds)
                 for n in picture_frames(clip, pictures):
                     with lock:
+                        if not has_image(clip, n, runner.method):
+                            continue
                         _collect_picture(shown, clip, n, name, runner.method, images, kinds)
 
     lock = threading.Lock()

@@ -126,14 +126,15 @@ def run_experiment(
         "costs": costs(runners, dataset),
         "rows": result["rows"],
     }
+    references = table_references(runners, clips["test"][0].sequence.scale)
     remarks = notes(dataset, clips["test"], settings, config)
     page = write_report(
-        out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=table_references()
+        out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references
     )
     lap("report")
     metrics["seconds"] = {**seconds, "total": round(sum(seconds.values()), 1)}
     write_json(out / "metrics.json", metrics)
-    print_table(metrics, references=table_references(), console=console)
+    print_table(metrics, references=references, console=console)
     for remark in remarks:
         console.print(f"[dim]{remark}[/dim]", soft_wrap=True)
     spent = ", ".join(f"{name} {value:.0f} s" for name, value in metrics["seconds"].items())

@@ -1,6 +1,6 @@
 """Two methods in a row: the first makes a colour for every frame, the second takes all of them for rendered.
 
-ExtraSS Table 3 feeds extrapolating methods at output resolution and smooths what comes out: ``extranet_taa``.
+ExtraSS Table 3 feeds extrapolating methods at output resolution and smooths what comes out: ``with_taa``.
 """
 
 import dataclasses
@@ -10,7 +10,6 @@ import jax.numpy as jnp
 
 from essjax.frames import Frame, Prediction, without_color
 from essjax.interfaces import Method, MethodInfo, Step, no_variables
-from essjax.methods.extranet import extranet
 from essjax.methods.taau import taa
 from essjax.typing import Callable, Color
 
@@ -99,19 +98,20 @@ def settled(method: Method) -> Method:
     )
 
 
-def extranet_taa(
-    *, alpha: float = 0.5, sigma: float = 0.5, history: bool = True, occlusion: bool = True, sky: bool = True
-) -> Method:
-    """ExtraNet on native-resolution frames, then temporal anti-aliasing of every frame (ExtraSS Table 3).
+def with_taa(first: Method, *, alpha: float = 0.5, sigma: float = 0.5) -> Method:
+    """``first`` on native-resolution frames, then temporal anti-aliasing of every frame (ExtraSS Table 3).
 
-    ``variables`` are ``extranet``'s. Extrapolated frames carry the jitter of their own G-buffers, as rendered ones do.
+    ``variables`` are the first's, its name gets "+taa". Frames that it makes carry the jitter of their own G-buffers,
+    as rendered ones do.
 
     Args:
+      first: makes the colour of frames that are not rendered, at their size: ``extranet()``, ``ifrnet()``.
       alpha: see ``taa``.
       sigma: see ``taa``.
-      history: see ``extranet``.
-      occlusion: see ``extranet``.
-      sky: see ``extranet``.
+
+    Raises:
+      ValueError: ``first`` changes the size.
     """
-    first = extranet(history=history, occlusion=occlusion, sky=sky)
-    return composed("extranet+taa", first, settled(taa(alpha=alpha, sigma=sigma)), native=True)
+    if first.info.scale != 1:
+        raise ValueError(f"with_taa: expected a method of scale 1, got {first.info.name} of {first.info.scale:g}.")
+    return composed(f"{first.info.name}+taa", first, settled(taa(alpha=alpha, sigma=sigma)), native=True)

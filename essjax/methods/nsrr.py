@@ -40,7 +40,7 @@ def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
     """
     frames = rendered.frames
     motion = jax.lax.stop_gradient(upsample_motion(frames.motion, scale, jitter=frame.jitter))
-    positions = pixel_positions(*motion.shape[-3:-1]) + motion
+    positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + motion
     return sample_zero_upsampled(frames.content, positions, scale, frames.jitter)
 
 

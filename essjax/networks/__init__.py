@@ -5,6 +5,7 @@ from essjax.networks.extranet import extranet
 from essjax.networks.extrassnet import extrassnet
 from essjax.networks.fasset import fasset
 from essjax.networks.frnet import frnet
+from essjax.networks.ifrnet import ifrnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = ["dlctus_network", "extranet", "extrassnet", "fasset", "frnet", "nsrr"]
+__all__ = ["dlctus_network", "extranet", "extrassnet", "fasset", "frnet", "ifrnet", "nsrr"]

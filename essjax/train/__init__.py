@@ -10,6 +10,8 @@ from essjax.train.objectives import (
     extrass_objective,
     fasset_objective,
     frnet_objective,
+    ifrnet_objective,
+    nsrr_objective,
     odd_length,
     predict_last,
 )
@@ -19,6 +21,6 @@ from essjax.train.step import make_train_step
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds", "constant",
     "cosine", "create_state", "dlctus_objective", "extranet_objective", "extrass_objective", "fasset_objective",
-    "frnet_objective", "halving", "learning_rate", "make_train_step", "odd_length", "optimizer", "predict_last",
-    "train",
+    "frnet_objective", "halving", "ifrnet_objective", "learning_rate", "make_train_step", "nsrr_objective",
+    "odd_length", "optimizer", "predict_last", "train",
 ]  # fmt: skip

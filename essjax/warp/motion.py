@@ -1,11 +1,12 @@
-"""Motion fields: jitter difference, composition along the path, upsampling, dilation."""
+"""Motion fields: jitter difference, composition along the path, upsampling, dilation, splatting."""
 
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
-from essjax.typing import Array, Jitter, Mask, Motion, Plane
+from essjax.typing import Array, Image, Jitter, Mask, Motion, Plane
 from essjax.warp._batch import check_channels
 from essjax.warp.sampling import inside_mask, sample
+from essjax.warp.splat import splat_nearest
 from essjax.warp.upsample import jitter_aligned_upsample
 
 
@@ -119,3 +120,25 @@ def dilate_motion(motion: Motion, depth: Plane, *, radius: int = 1) -> Motion:
         nearest = jnp.where(closer, other, nearest)
         result = jnp.where(closer, _shifted(padded_motion, dy, dx, radius, height, width), result)
     return result
+
+
+def splat_motion(values: Image, depth: Plane, motion: Motion) -> tuple[Image, Plane, Mask]:
+    """What pixels carry, seen from where their motion leads: ``splat_nearest``, its cracks filled.
+
+    A crack (a pixel that nothing was written to, next to one that was) takes the values of the nearest surface around.
+
+    Args:
+      values: ``[..., H, W, C]`` of the current frame, for example motion.
+      depth: ``[..., H, W, 1]`` of the current frame, background +inf.
+      motion: ``[..., H, W, 2]`` pixels, current to previous, with the jitter difference where frames are jittered.
+
+    Returns:
+      On the previous frame's pixels: the values ``[..., H, W, C]`` and the depth that came with them, 0 where nothing
+      is known, and ``[..., H, W, 1]``: 1 where a pixel was written to, 0.5 in filled cracks, 0 where nothing is known.
+    """
+    splatted, covered = splat_nearest(jnp.concatenate([values, depth], axis=-1), depth, motion)
+    # Finite, so that background counts as nearer than nothing.
+    key = jnp.where(covered > 0, jnp.minimum(splatted[..., -1:], jnp.finfo(depth.dtype).max), jnp.inf)
+    neighbour = dilate_motion(jnp.concatenate([splatted, covered], axis=-1), key)
+    filled = jnp.where(covered > 0, splatted, neighbour[..., :-1])
+    return filled[..., :-1], filled[..., -1:], jnp.maximum(covered, 0.5 * neighbour[..., -1:])

@@ -7,9 +7,8 @@ from essjax.cameras import pixel_positions
 from essjax.frames import GBuffers
 from essjax.typing import Array, Jitter, Mask, Motion, Plane
 from essjax.warp._batch import check_channels
-from essjax.warp.motion import dilate_motion, jittered_motion
+from essjax.warp.motion import jittered_motion, splat_motion
 from essjax.warp.sampling import axis_taps, inside_mask, sample
-from essjax.warp.splat import splat_nearest
 
 _MIN_N_DOT_V = 0.1
 _TYPICAL_N_DOT_V = 0.25  # where the channel is absent: towards grazing, so that floors are not holes
@@ -36,11 +35,7 @@ def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
     """
     check_channels("hole", hole, 1, motion.shape[-3:-1])
     visible_motion = jnp.where(hole < 0.5, _OFF_SCREEN, motion)
-    splatted, covered = splat_nearest(jnp.concatenate([motion, depth], axis=-1), depth, visible_motion)
-    depth_there = jnp.where(covered > 0, splatted[..., 2:], jnp.inf)
-    neighbour = dilate_motion(jnp.concatenate([splatted[..., :2], covered], axis=-1), depth_there)
-    filled = jnp.where(covered > 0, splatted[..., :2], neighbour[..., :2])
-    known = jnp.maximum(covered, neighbour[..., 2:])
+    filled, _, known = splat_motion(motion, depth, visible_motion)
     positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + motion
     found = sample(jnp.concatenate([filled, known], axis=-1), positions, mode="nearest", outside="zeros")
     return jnp.where((hole < 0.5) & (found[..., 2:] > 0), found[..., :2], motion)

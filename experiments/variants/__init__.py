@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, dlctus, extranet, extrass, fasset
+from experiments.variants import baselines, dlctus, extranet, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
@@ -11,19 +11,14 @@ VARIANTS: dict[str, Variant] = {
     **extranet.VARIANTS,
     **fasset.VARIANTS,
     **dlctus.VARIANTS,
+    **nsrr.VARIANTS,
+    **interpolation.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""
 
 BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "taau-half", "taau", "taa")
 """Rows of every table."""
-EVERY_FRAME = "gets every frame rendered: twice the input"
-REFERENCES = {
-    **dict.fromkeys(("taau", "tus", *dlctus.VARIANTS), EVERY_FRAME),
-    "extranet+taa": "works at native resolution: four times the input",
-    "taa": "gets every frame rendered at native resolution: eight times the input",
-}
-"""Rows that are not on equal terms, and why."""
 
 
 def get_variant(name: str) -> Variant:

@@ -10,7 +10,7 @@ from experiments.variants.base import Stage, Variant, main_budget
 EPOCHS = 200
 PRESETS = {
     "smoke": {"clip": 4},
-    "quick": {"clip": 10, "learning_rate": 2e-3, "seconds": 290.0},
+    "quick": {"clip": 10, "learning_rate": 4e-3, "seconds": 290.0},
     "paper": {"clip": 30, "batch": 4, "learning_rate": 1e-4, "steps": EPOCHS * 1800, "anneal": False},
 }
 

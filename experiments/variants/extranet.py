@@ -42,7 +42,7 @@ VARIANTS = {
     "extranet-no-omv": _variant("ExtraNet without occlusion motion vectors", occlusion=False),
     "extranet+taa": Variant(
         "ExtraNet at native resolution, then temporal anti-aliasing: half of the frames rendered, all pixels",
-        lambda config: methods.extranet_taa(),
+        lambda config: methods.with_taa(methods.extranet()),
         weights="extranet",
     ),
 }

@@ -96,8 +96,21 @@ def test_list_names_all_variants(capsys):
     assert all(name in printed for name in variants.VARIANTS)
 
 
-def test_taa_is_left_out_without_native_frames():
-    assert "native" in comparison.table_references()["taa"]
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("extrass", ""),
+        ("taau-half", ""),
+        ("taau", "gets every frame rendered: twice the input"),
+        ("taa", "gets every frame rendered at native resolution: eight times the input"),
+        ("nsrr", "gets every frame rendered: twice the input"),
+        ("extranet+taa", "gets rendered frames at native resolution: four times the input"),
+        ("bsr", "+1 frame of latency: it interpolates; frames without a later one are not scored"),
+    ],
+)
+def test_rows_that_are_not_on_equal_terms(name, reason):
+    config = variants.config_of(name, "smoke", [])
+    assert comparison.unequal(variants.VARIANTS[name].method(config).info, 2) == reason
 
 
 def test_compare_shares_one_training_between_variants_that_differ_in_their_steps(finished, tmp_path, monkeypatch):

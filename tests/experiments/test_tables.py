@@ -7,6 +7,7 @@ import pytest
 from essjax.deploy import Cost
 from experiments import tables
 from experiments.tables.base import Metric, Row, Table, agreement, check, markdown, measured, verdict
+from experiments.variants import VARIANTS
 
 TOY = Table(
     name="toy-1",
@@ -79,6 +80,14 @@ def test_a_literal_that_does_not_fit_is_named():
         check(TOY._replace(paper={"ours": {"PSNR": (1.0,)}}))
     with pytest.raises(ValueError, match="row 'our' is not among ours"):
         check(TOY._replace(paper={"our": {}}))
+
+
+def test_every_row_stands_for_a_variant():
+    assert set(tables.TABLES) >= {"extrass-1", "extrass-2", "extrass-3", "extranet-4", "extranet-7", "fasset-2"}
+    for table in tables.TABLES.values():
+        unknown = {row.variant for row in table.rows.values() if row.variant} - set(VARIANTS)
+        assert not unknown, (table.name, unknown)
+        assert set(table.paper) == set(table.rows), table.name
 
 
 def test_the_command_names_what_is_wrong(tmp_path, capsys):

@@ -10,7 +10,7 @@ import pytest
 from essjax.color import log1p
 from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo, no_variables
-from essjax.methods import composed, extranet, extranet_taa, settled, taa, warp
+from essjax.methods import composed, extranet, ifrnet, jau, settled, taa, warp, with_taa
 from essjax.rollout import alternate, every, unroll
 from tests.helpers import make_frames
 
@@ -81,18 +81,26 @@ def test_the_second_sees_the_frame_that_the_image_belongs_to(late):
         composed("late", lagging(2), watching())
 
 
-def test_extranet_taa_has_the_variables_of_extranet():
+@pytest.mark.parametrize("first", [extranet(), ifrnet(width=8)], ids=lambda method: method.info.name)
+def test_with_taa_it_has_the_variables_of_the_first(first):
     frames = make_frames(2, T=1, B=B, H=H, W=W)
-    method, frame = extranet_taa(), select_time(frames, 0)
+    method, frame = with_taa(first), select_time(frames, 0)
+    assert method.info.name == f"{first.info.name}+taa" and method.info.latency == first.info.latency
     assert method.info.native and method.info.scale == 1 and method.info.predicts == {"ss", "ess"}
-    assert method.info.requires == extranet().info.requires
-    shapes = [jax.eval_shape(m.init, jax.random.key(0), frame) for m in (method, extranet())]
+    assert method.info.requires == first.info.requires
+    shapes = [jax.eval_shape(m.init, jax.random.key(0), frame) for m in (method, first)]
     assert jax.tree.structure(shapes[0]) == jax.tree.structure(shapes[1])
     bare = dataclasses.replace(frame, color=None)
     history = jax.eval_shape(method.start, bare)
     later, prediction = jax.eval_shape(method.extrapolate_step, shapes[0], history, bare)
-    assert prediction.image.shape == (B, H, W, 3) and "log_shading" in prediction.aux["first"].aux
+    alone = jax.eval_shape(first.extrapolate_step, shapes[1], first.start(bare), bare)[1]
+    assert prediction.image.shape == (B, H, W, 3) and set(prediction.aux["first"].aux) == set(alone.aux)
     assert jax.tree.map(jnp.shape, later) == jax.tree.map(jnp.shape, history)
+
+
+def test_taa_needs_frames_of_one_size():
+    with pytest.raises(ValueError, match="with_taa: expected a method of scale 1, got jau of 2"):
+        with_taa(jau(2))
 
 
 def test_settled_needs_no_variables():

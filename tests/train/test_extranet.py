@@ -57,7 +57,9 @@ def test_the_last_frame_is_predicted_from_the_alternation(length, kinds):
     log = np.asarray(prediction.aux["log"])
     np.testing.assert_array_equal(log[-length:], np.stack([np.arange(length), kinds], axis=-1))
     assert (log[:-length] == -1).all() and prediction.state["extranet"]["batch_stats"] is True
-    with pytest.raises(ValueError, match="clip: expected at least 2 frames, one to extrapolate from, got 1"):
+    with pytest.raises(
+        ValueError, match="clip: expected at least 2 frames, the last to predict and one before it, got 1"
+    ):
         predict_last(fake(SHADING, MASK), {"extranet": 1.0}, numbered(1).frames)
 
 

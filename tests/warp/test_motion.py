@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from essjax.cameras import pixel_positions
-from essjax.warp import backward_warp, compose_motion, dilate_motion, jittered_motion, sample, upsample_motion
+from essjax.warp import (
+    backward_warp,
+    compose_motion,
+    dilate_motion,
+    jittered_motion,
+    sample,
+    splat_motion,
+    upsample_motion,
+)
 
 H, W = 9, 12
 FEW = settings(max_examples=10, deadline=None)
@@ -151,3 +159,21 @@ def test_dilation_errors():
         dilate_motion(jnp.zeros((H, W, 2)), jnp.ones((H, W, 1)), radius=-1)
     with pytest.raises(ValueError, match=r"depth: expected \[..., 9, 12, 1\], got \(9, 12, 2\)"):
         dilate_motion(jnp.zeros((H, W, 2)), jnp.ones((H, W, 2)))
+
+
+def test_splatted_motion_fills_cracks_by_the_nearest_surface_and_no_holes():
+    """Columns spread to twice their number, which leaves every second one empty; rows from 6 on leave the image."""
+    motion, depth = np.zeros((H, W, 2), np.float32), np.full((H, W, 1), np.inf, np.float32)
+    motion[..., 0] = np.arange(W)
+    motion[6:] = 100.0
+    depth[:, :4, 0] = [3.0, 2.0, 3.0, 2.0]
+    values = np.broadcast_to(np.arange(W, dtype=np.float32)[:, None], (H, W, 1))
+    got, carried, known = (np.asarray(x[..., 0]) for x in jax.jit(splat_motion)(values, depth, motion))
+    source = [0, 1, 1, 1, 2, 3, 3, 3, 4, 4, 5, 5]  # 4 and 5 are sky, which fills cracks in itself
+    for row in range(7):
+        if row < 6:
+            np.testing.assert_array_equal(got[row, :9], source[:9])
+        np.testing.assert_array_equal(carried[row, 1:8:2], depth[0, source[1:8:2], 0])
+        np.testing.assert_array_equal(known[row], np.where(np.arange(W) % 2, 0.5, 1.0 if row < 6 else 0.5))
+    np.testing.assert_array_equal(known[7:], 0.0)
+    assert np.isinf(carried[2, 8:]).all()

@@ -5,8 +5,10 @@ from essjax.train.objectives.dlctus import dlctus_objective
 from essjax.train.objectives.extranet import extranet_objective
 from essjax.train.objectives.extrass import extrass_objective, frnet_objective
 from essjax.train.objectives.fasset import fasset_objective
+from essjax.train.objectives.ifrnet import ifrnet_objective
+from essjax.train.objectives.nsrr import nsrr_objective
 
 __all__ = [
     "Objective", "both_kinds", "dlctus_objective", "extranet_objective", "extrass_objective", "fasset_objective",
-    "frnet_objective", "odd_length", "predict_last",
+    "frnet_objective", "ifrnet_objective", "nsrr_objective", "odd_length", "predict_last",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What objectives are, and the rollout that predicts every frame as both kinds."""
+"""What objectives are, and the rollouts behind them: every frame as both kinds, or the last frame alone."""
 
 import dataclasses
 from functools import partial
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from essjax.frames import Frame, Prediction, Sequence, select_time, without_color
 from essjax.interfaces import Method
-from essjax.rollout import ESS, SS, alternate, unroll
+from essjax.rollout import ESS, SS, Schedule, alternate, unroll
 from essjax.typing import Array, Callable, PyTree
 
 Objective = Callable[[PyTree, Sequence], tuple[dict[str, Array], PyTree]]
@@ -54,35 +54,43 @@ def odd_length(clip: Sequence) -> Sequence:
     return clip if length % 2 else select_time(clip, slice(0, length - 1))
 
 
-def predict_last(method: Method, variables: PyTree, frames: Frame) -> Prediction:
-    """Extrapolate the last frame of a clip (``train=True``) from the history that the alternation gives it.
+def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Schedule | None = None) -> Prediction:
+    """What the step of the last frame of a clip returns (``train=True``), from the history that the schedule gives it.
 
-    For methods whose history holds rendered frames only: no gradient flows through it. What is predicted on the way is
-    not computed, because nothing reads it.
+    For losses on that frame alone. Of the steps before it only what the history needs is computed and differentiated.
 
     Args:
-      method: extrapolates.
+      method: the two steps.
       variables: its variables.
       frames: ``[T, ...]``, T >= 2.
+      schedule: of the clip; None: the alternation that extrapolates the last frame.
 
     Raises:
       ValueError: there are fewer than two frames.
     """
     length = frames.motion.shape[0]
     if length < 2:
-        raise ValueError(f"clip: expected at least 2 frames, one to extrapolate from, got {length}.")
+        raise ValueError(f"clip: expected at least 2 frames, the last to predict and one before it, got {length}.")
+    schedule = alternate(length % 2) if schedule is None else schedule
+    kinds, (_, period, lead) = schedule.kinds(length), schedule
 
-    def render(history: PyTree, frame: Frame) -> PyTree:
-        return method.render_step(variables, history, frame)[0]
+    def step(history: PyTree, frame: Frame, kind: str, train: bool = False) -> tuple[PyTree, Prediction]:
+        if kind == SS:
+            return method.render_step(variables, history, frame, train=train)
+        return method.extrapolate_step(variables, history, without_color(frame), train=train)
 
-    def pair(history: PyTree, chunk: Frame) -> tuple[PyTree, None]:
-        history = render(history, select_time(chunk, 0))
-        return method.extrapolate_step(variables, history, without_color(select_time(chunk, 1)))[0], None
+    def several(history: PyTree, chunk: Frame) -> tuple[PyTree, None]:
+        for k in range(period):
+            history, _ = step(history, select_time(chunk, k), kinds[lead + k])
+        return history, None
 
-    history = method.start(select_time(frames, 0))
-    if length % 2:  # the alternation that ends with an extrapolated frame starts with a warm-up
-        history, frames = render(history, select_time(frames, 0)), select_time(frames, slice(1, length))
-    pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, 2, *leaf.shape[1:]), frames)
-    history, _ = jax.lax.scan(pair, history, select_time(pairs, slice(0, -1)))
-    history = render(history, select_time(frames, -2))
-    return method.extrapolate_step(variables, history, without_color(select_time(frames, -1)), train=True)[1]
+    lead = min(lead, length - 1)
+    scanned = (length - 1 - lead) // period
+    body_end, history = lead + scanned * period, method.start(select_time(frames, 0))
+    for n in range(lead):
+        history, _ = step(history, select_time(frames, n), kinds[n])
+    body = jax.tree.map(lambda leaf: leaf[lead:body_end].reshape(scanned, period, *leaf.shape[1:]), frames)
+    history, _ = jax.lax.scan(several, history, body)
+    for n in range(body_end, length - 1):
+        history, _ = step(history, select_time(frames, n), kinds[n])
+    return step(history, select_time(frames, length - 1), kinds[-1], train=True)[1]

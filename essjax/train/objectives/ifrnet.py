@@ -1,0 +1,43 @@
+"""What IFRNet minimises (Kong et al. 2022): reconstruction and feature space geometry, on log(1 + x)."""
+
+import jax
+import jax.numpy as jnp
+
+from essjax.color import log1p
+from essjax.frames import Sequence, rendered_color, select_time
+from essjax.interfaces import Method, Network
+from essjax.losses import census, charbonnier, feature_census, sum_of_means
+from essjax.rollout import alternate
+from essjax.train.objectives.common import Objective, predict_last
+from essjax.typing import Array, PyTree
+
+
+def ifrnet_objective(method: Method, network: Network, *, feature_weight: float = 0.01) -> Objective:
+    """Charbonnier, census and feature geometry of the middle one of a clip's last three frames.
+
+    Args:
+      method: ``ifrnet``.
+      network: its network, whose encoder makes the target's features.
+      feature_weight: of the feature space geometry loss.
+    """
+
+    def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
+        length = clip.frames.motion.shape[0]
+        if length < 3:
+            raise ValueError(f"clip: expected at least 3 frames (two rendered ones around a third), got {length}.")
+        frames = select_time(clip.frames, slice(-3, None))
+        prediction = predict_last(method, variables, frames, alternate(0))
+        predicted = prediction.aux
+        target = log1p(rendered_color(frames, "ifrnet")[1])
+        # The target's features are given, as in ``frnet_objective``.
+        given = jax.lax.stop_gradient(variables["ifrnet"])
+        features, _ = network.apply(given, target - predicted["mean"], method="encode")
+        distances = [feature_census(a, b) for a, b in zip(predicted["features"], features, strict=False)]
+        terms = {
+            "charbonnier": jnp.mean(charbonnier(predicted["image"], target)),
+            "census": jnp.mean(census(predicted["image"], target)),
+            "feature_census": feature_weight * sum_of_means(distances),
+        }
+        return terms, prediction.state
+
+    return objective
