@@ -20,7 +20,7 @@ from essjax.methods.rendered import Memory, advance, albedo, push, reset_memory,
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import from_torch as network_from_torch
 from essjax.tensors import read_tensors
-from essjax.typing import Array, Color, Image, Mask, Plane, PyTree, pytree
+from essjax.typing import Array, Color, Image, Mask, Motion, Plane, PyTree, pytree
 from essjax.warp import backward_warp, hole_mask, jittered_motion, occlusion_motion
 
 REQUIRES = frozenset({"base_color", "normal", "roughness", "metallic"})
@@ -83,7 +83,15 @@ def relative_depth(gbuffers: GBuffers) -> Plane:
     return (depth - low) / (high - low + 1e-6)
 
 
-def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, mode: str = "bilinear") -> Inputs:
+def _around(memory: Memory, frame: Frame, valid: Mask) -> Motion:
+    """Lookup in the newest rendered frame: by occlusion motion in holes, by plain motion elsewhere."""
+    motion = jittered_motion(memory.frames.motion[0], frame.jitter, memory.frames.jitter[0])
+    return occlusion_motion(motion, frame.gbuffers.depth, valid)
+
+
+def network_inputs(
+    memory: Memory, frame: Frame, *, occlusion: bool = True, sky: bool = True, mode: str = "bilinear"
+) -> Inputs:
     """Warps, masks and features for ``frame``, to which ``memory`` was advanced; no gradient.
 
     Every rendered frame is warped along its own composed path and has a hole mask of its own (section 4.4), 0 where
@@ -93,6 +101,7 @@ def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, mode
       memory: of rendered frames.
       frame: the new one.
       occlusion: also warp by occlusion motion vectors (section 4.2); False: Table 7's "w/o OMV".
+      sky: False shows the background of rendered frames as black.
       mode: how shading is read, see ``warp.sample``; it may have more than three channels.
     """
     frames, kept = memory.frames, memory.frames.content
@@ -107,11 +116,11 @@ def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, mode
     valid = jnp.where(expand_flag(memory.count == 0, valid.ndim - 1), 0.0, valid * frames.valid)
     if frame.reactive is not None:
         valid = valid * (1.0 - frame.reactive)
-    plain = log1p(backward_warp(kept.shading, motion, mode=mode))
+    shading = kept.shading if sky else jnp.where(background(kept.gbuffers), 0.0, kept.shading)
+    plain = log1p(backward_warp(shading, motion, mode=mode))
     warped = [plain[0]]
     if occlusion:
-        around = occlusion_motion(motion[0], frame.gbuffers.depth, valid[0])
-        warped.append(log1p(backward_warp(kept.shading[0], around, mode=mode)))
+        warped.append(log1p(backward_warp(shading[0], _around(memory, frame, valid[0]), mode=mode)))
     # Nothing was hit: the published weights were trained with (-1, -1, -1) there.
     normal = jnp.where(background(frame.gbuffers), -1.0, surface_guides(frame.gbuffers)[1])
     features = [normal, relative_depth(frame.gbuffers), frame.gbuffers.roughness, frame.gbuffers.metallic]
@@ -124,16 +133,18 @@ def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, mode
     return jax.lax.stop_gradient(inputs)
 
 
-def extranet(*, history: bool = True, occlusion: bool = True) -> Method:
+def extranet(*, history: bool = True, occlusion: bool = True, sky: bool = True) -> Method:
     """ExtraNet: extrapolates frames between rendered ones at low resolution; rendered ones are returned as they are.
 
-    ``variables = {"extranet": {"params", "batch_stats"}}``, 262,141 parameters; ``from_torch`` reads published ones. A
-    fresh network returns the plain warp of the demodulated frame. ``aux`` of an extrapolated step: ``log_shading`` (the
-    output, demodulated, log1p) and ``inputs`` (``Inputs``).
+    ``variables = {"extranet": {"params", "batch_stats"}}``, 262,141 parameters; ``from_torch`` reads published ones,
+    for which ``sky`` must be False. A fresh network returns the plain warp of the demodulated frame. ``aux`` of an
+    extrapolated step: ``log_shading`` (the output, demodulated, log1p) and ``inputs`` (``Inputs``).
 
     Args:
       history: with the history encoder (Table 7, HE).
       occlusion: with a warp by occlusion motion vectors (Table 7, OMV).
+      sky: the network extrapolates the background too. False: it sees black there, and the background is warped (by
+        occlusion motion where it was disoccluded); the published weights never saw a sky, whose base colour is 0.
     """
     network = networks.extranet(history=history)
 
@@ -148,10 +159,13 @@ def extranet(*, history: bool = True, occlusion: bool = True) -> Method:
 
     def extrapolate_step(variables, history, frame, *, train=False):
         memory = _advance(history, frame)
-        seen = network_inputs(memory, frame, occlusion=occlusion)
+        seen = network_inputs(memory, frame, occlusion=occlusion, sky=sky)
         inputs = seen.warped, seen.mask, seen.features, seen.history
         log_shading, state = network.apply(variables["extranet"], *inputs, train=train)
         image = modulate(expm1(log_shading), albedo(frame.gbuffers))
+        if not sky:  # it is not modulated: shading is colour
+            behind = backward_warp(memory.frames.content.shading[0], _around(memory, frame, seen.mask))
+            image = jnp.where(background(frame.gbuffers), jax.lax.stop_gradient(behind), image)
         aux = {"log_shading": log_shading, "inputs": seen}
         return memory, Prediction(image=image, aux=aux, state={"extranet": state} if state else {})
 
@@ -160,7 +174,7 @@ def extranet(*, history: bool = True, occlusion: bool = True) -> Method:
 
 
 def from_torch(weights: str | Path | Mapping[str, Array]) -> PyTree:
-    """Variables of ``extranet()`` from published weights.
+    """Variables of ``extranet(sky=False)`` from published weights.
 
     Args:
       weights: a file (see ``tensors.read_tensors``; a ``.pth.tar`` needs no PyTorch), or arrays by the published names.

@@ -1,6 +1,7 @@
 """Every variant on one rendered scene: each stage of its smoke preset trains, and streaming is unrolling."""
 
 import functools
+import os
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,9 @@ from experiments.config import PRESETS
 from experiments.training import initial_variables, make_batches
 from experiments.variants import VARIANTS, config_of, stages_of
 
+pytestmark = pytest.mark.skipif(
+    not os.environ.get("ESSJAX_SWEEP"), reason="compiles every variant, minutes: set ESSJAX_SWEEP=1 to run it"
+)
 STEPS = 8
 SIZES = ["size=[40,28]", "crop=[32,24]", "test_frames=7", "train_frames=7"]
 STREAMED = [

@@ -108,6 +108,31 @@ def test_before_training_it_warps_the_demodulated_frame():
     np.testing.assert_allclose(images[5], expected, rtol=1e-4, atol=1e-5)
 
 
+def test_published_weights_see_a_black_sky_and_the_sky_is_warped():
+    """On frames whose rendered sky is another colour only the sky changes, and its pixels come from the warp."""
+    frames, method = random_frames(7), extranet(sky=False)
+    sky = ~np.isfinite(frames.gbuffers.depth)
+    render = step(SS)
+    extrapolate = jax.jit(method.extrapolate_step)
+
+    def last(frames):
+        history, prediction = METHOD.start(select_time(frames, 4)), None
+        history, _ = render(variables(), history, select_time(frames, 4))
+        _, prediction = extrapolate(variables(), history, without_color(select_time(frames, 5)))
+        return prediction
+
+    one, other = last(frames), last(dataclasses.replace(frames, color=jnp.where(sky, frames.color + 1.0, frames.color)))
+    surface = np.broadcast_to(~sky[5], one.image.shape)
+    np.testing.assert_array_equal(np.asarray(one.image)[surface], np.asarray(other.image)[surface])
+    assert float(jnp.abs(one.image - other.image).max()) > 0.5
+    at, seen = select_time(frames, 5), one.aux["inputs"]
+    lookup = jittered_motion(at.motion, at.jitter, frames.jitter[4])
+    before = demodulate(frames.color[4], albedo(select_time(frames, 4).gbuffers))
+    warped = backward_warp(before, occlusion_motion(lookup, at.gbuffers.depth, seen.mask))
+    np.testing.assert_allclose(np.asarray(one.image)[~surface], np.asarray(warped)[~surface], rtol=1e-4, atol=1e-5)
+    assert 5 < (~surface).sum() < surface.sum()
+
+
 def test_depth_as_the_published_weights_know_it():
     depth = jnp.array([[[2.0], [jnp.inf], [6.0]], [[4.0], [8.0], [2.0]]])
     buffers = select_time(random_frames().gbuffers, 0)
