@@ -7,13 +7,14 @@ from essjax.methods.extranet import extranet
 from essjax.methods.extranet import from_torch as extranet_from_torch
 from essjax.methods.extrass import extrass, extrass_e, extrass_w
 from essjax.methods.fasset import fasset
+from essjax.methods.fasset_baselines import extranet_nsrr, extranet_plus, nsrr_extranet
 from essjax.methods.ifrnet import ifrnet
 from essjax.methods.interpolation import bsr, warp_3d
 from essjax.methods.nsrr import nsrr
 from essjax.methods.taau import taa, taau, taau_half, tus
 
 __all__ = [
-    "bicubic", "bilinear", "bsr", "composed", "dlctus", "extranet", "extranet_from_torch", "extrass", "extrass_e",
-    "extrass_w", "fasset", "gaussian_blur", "ifrnet", "jau", "jau_image", "nsrr", "settled", "taa", "taau", "taau_half",
-    "tus", "warp", "warp_3d", "with_taa",
+    "bicubic", "bilinear", "bsr", "composed", "dlctus", "extranet", "extranet_from_torch", "extranet_nsrr",
+    "extranet_plus", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur", "ifrnet", "jau", "jau_image",
+    "nsrr", "nsrr_extranet", "settled", "taa", "taau", "taau_half", "tus", "warp", "warp_3d", "with_taa",
 ]  # fmt: skip

@@ -24,9 +24,10 @@ def composed(
     second: Method,
     *,
     native: bool = False,
+    extrapolates: bool = False,
     between: Callable[[Frame, Color], Frame] = _with_color,
 ) -> Method:
-    """``second.render_step`` on every image of ``first``.
+    """``second.render_step`` on every image of ``first``, or ``second``'s step of the frame's own kind.
 
     ``variables`` are those of both, side by side. ``aux`` is the second's, and the first's prediction as ``"first"``.
     Where the first lags behind (interpolation), the second sees the frame that the image belongs to.
@@ -34,8 +35,9 @@ def composed(
     Args:
       name: of the whole.
       first: makes the colours.
-      second: sees no frame without colour.
+      second: sees no frame without colour, unless ``between`` takes it away.
       native: both work on frames of the reference's resolution.
+      extrapolates: extrapolated frames go to ``second.extrapolate_step``, with the colour that ``between`` gives them.
       between: ``(frame, the first's image) -> frame`` for the second; replace it where sizes change on the way.
 
     Raises:
@@ -59,11 +61,11 @@ def composed(
         # A copy: a streaming step donates its history.
         return {**history, "frame": jax.tree.map(jnp.copy, without_color(example))} if late else history
 
-    def after(step: Step) -> Step:
+    def after(step: Step, then: Step) -> Step:
         def run(variables, history, frame, *, train=False):
             earlier, made = step(variables, history["first"], frame, train=train)
             shown = between(history["frame"] if late else frame, made.image)
-            later, result = second.render_step(variables, history["second"], shown, train=train)
+            later, result = then(variables, history["second"], shown, train=train)
             history = {"first": earlier, "second": later}
             history = {**history, "frame": without_color(frame)} if late else history
             aux = {**result.aux, "first": made}
@@ -79,7 +81,14 @@ def composed(
         native=native,
         renders_all=first.info.renders_all,
     )
-    return Method(init, start, after(first.render_step), after(first.extrapolate_step), info)
+    extrapolate = second.extrapolate_step if extrapolates else second.render_step
+    return Method(
+        init,
+        start,
+        after(first.render_step, second.render_step),
+        after(first.extrapolate_step, extrapolate),
+        info,
+    )
 
 
 def settled(method: Method) -> Method:

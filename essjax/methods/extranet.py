@@ -58,9 +58,13 @@ class Inputs:
     history: Image
 
 
+def hole_buffers(gbuffers: GBuffers) -> GBuffers:
+    """Those that marking holes needs of an earlier frame."""
+    return dataclasses.replace(gbuffers, base_color=None, roughness=None, metallic=None, specular=None, n_dot_v=None)
+
+
 def _kept(color: Color, gbuffers: GBuffers) -> Kept:
-    unused = dict.fromkeys(("base_color", "roughness", "metallic", "specular", "n_dot_v"))
-    return Kept(shading=demodulate(color, albedo(gbuffers)), gbuffers=dataclasses.replace(gbuffers, **unused))
+    return Kept(shading=demodulate(color, albedo(gbuffers)), gbuffers=hole_buffers(gbuffers))
 
 
 def _start(example: Frame) -> Memory:
@@ -85,7 +89,9 @@ def _around(memory: Memory, frame: Frame, valid: Mask) -> Motion:
     return occlusion_motion(motion, frame.gbuffers.depth, valid)
 
 
-def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, sky: bool = True) -> Inputs:
+def network_inputs(
+    memory: Memory, frame: Frame, *, occlusion: bool = True, sky: bool = True, mode: str = "bilinear"
+) -> Inputs:
     """Warps, masks and features for ``frame``, to which ``memory`` was advanced; no gradient.
 
     Every rendered frame is warped along its own composed path and has a hole mask of its own (section 4.4), 0 where
@@ -96,6 +102,7 @@ def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, sky:
       frame: the new one.
       occlusion: also warp by occlusion motion vectors (section 4.2); False: Table 7's "w/o OMV".
       sky: False shows the background of rendered frames as black.
+      mode: how shading is read, see ``warp.sample``; it may have more than three channels.
     """
     frames, kept = memory.frames, memory.frames.content
 
@@ -110,10 +117,10 @@ def network_inputs(memory: Memory, frame: Frame, *, occlusion: bool = True, sky:
     if frame.reactive is not None:
         valid = valid * (1.0 - frame.reactive)
     shading = kept.shading if sky else jnp.where(background(kept.gbuffers), 0.0, kept.shading)
-    plain = log1p(backward_warp(shading, motion))
+    plain = log1p(backward_warp(shading, motion, mode=mode))
     warped = [plain[0]]
     if occlusion:
-        warped.append(log1p(backward_warp(shading[0], _around(memory, frame, valid[0]))))
+        warped.append(log1p(backward_warp(shading[0], _around(memory, frame, valid[0]), mode=mode)))
     # Nothing was hit: the published weights were trained with (-1, -1, -1) there.
     normal = jnp.where(background(frame.gbuffers), -1.0, surface_guides(frame.gbuffers)[1])
     features = [normal, relative_depth(frame.gbuffers), frame.gbuffers.roughness, frame.gbuffers.metallic]

@@ -4,6 +4,8 @@ Every frame is rendered. Previous frames are zero-upsampled and warped to the cu
 each by a single bilinear read; there is no recurrence of the output. Colour is display-referred inside.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -44,7 +46,7 @@ def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
     return sample_zero_upsampled(frames.content, positions, scale, frames.jitter)
 
 
-def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True) -> Method:
+def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool = False) -> Method:
     """Neural supersampling of a sequence that is rendered in every frame.
 
     ``variables = {"nsrr": ...}``. ``aux``: ``display_image``, the output before it is clipped to [0, 1] (x / (1 + x),
@@ -55,6 +57,8 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True) -> Method:
       width: of the network, 32 as published.
       residual: add the jitter-aligned upsampled current frame to the network's output, which starts at zero: untrained
         it is the baseline ``jau``. The paper's network returns the image itself.
+      half: for sequences of which some frames are not rendered. ``extrapolate_step`` then follows the motion only and
+        shows black; a colour that another method made for the frame is supersampled, but never looked back at.
     """
     network = nsrr_network(width)
 
@@ -68,21 +72,34 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True) -> Method:
         shapes = (*lead, height, wide, RGBD), high, (PREVIOUS, *high)
         return {"nsrr": network.init(key, *(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes))}
 
-    def render_step(variables, history, frame, *, train=False):
-        color = rendered_color(frame, info.name)
+    def arrive(history, frame):
         fresh = start(frame)
         rendered = reset_memory(frame.cut, fresh.rendered, history.rendered)
         unit = reset_at_cut(frame.cut, fresh.depth_scale, history.depth_scale)
-        rendered = advance(rendered, frame)
-        rgbd = jnp.concatenate([display(color), network_depth(frame.gbuffers, unit)], axis=-1)
+        return History(rendered=advance(rendered, frame), depth_scale=unit)
+
+    def supersample(variables, history, frame, train):
+        rgbd = jnp.concatenate([display(frame.color), network_depth(frame.gbuffers, history.depth_scale)], axis=-1)
         own, _ = network.apply(variables["nsrr"], rgbd, train=train, method="current")
         own = zero_upsample(own, scale, frame.jitter)
-        warped = warp_previous(rendered, frame, scale)
+        warped = warp_previous(history.rendered, frame, scale)
         (output, weights), _ = network.apply(variables["nsrr"], own, warped, train=train, method="reconstruct")
         shown = output + display(jau_image(frame, scale)) if residual else output
-        remembered, _ = network.apply(variables["nsrr"], rgbd, train=train, method="previous")
-        history = History(rendered=push(rendered, frame, remembered), depth_scale=unit)
-        return history, Prediction(image=display_inverse(shown), aux={"display_image": shown, "weights": weights})
+        return Prediction(image=display_inverse(shown), aux={"display_image": shown, "weights": weights}), rgbd
 
-    info = MethodInfo("nsrr", scale=scale, predicts=frozenset({"ss"}), renders_all=True)
-    return Method(init, start, render_step, refuse_extrapolation("nsrr"), info)
+    def render_step(variables, history, frame, *, train=False):
+        rendered_color(frame, info.name)
+        history = arrive(history, frame)
+        prediction, rgbd = supersample(variables, history, frame, train)
+        remembered, _ = network.apply(variables["nsrr"], rgbd, train=train, method="previous")
+        return dataclasses.replace(history, rendered=push(history.rendered, frame, remembered)), prediction
+
+    def pass_step(variables, history, frame, *, train=False):
+        history = arrive(history, frame)
+        if frame.color is not None:
+            return history, supersample(variables, history, frame, train)[0]
+        *lead, height, wide, _ = frame.motion.shape
+        return history, Prediction(image=jnp.zeros((*lead, scale * height, scale * wide, 3)))
+
+    info = MethodInfo("nsrr", scale=scale, predicts=frozenset({"ss"}), renders_all=not half)
+    return Method(init, start, render_step, pass_step if half else refuse_extrapolation("nsrr"), info)

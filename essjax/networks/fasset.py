@@ -55,7 +55,7 @@ class FrameEncoder(nn.Module):
         for level, width in enumerate(widths):
             x = mean_pool(x) if level else x
             for _ in range(2 if level else 3):
-                x = nn.relu(GatedConv(width, norm=False)(x))
+                x = nn.relu(2.0 * GatedConv(width, norm=False)(x))  # a fresh gate passes half
             if level == 0:
                 x = hidden = ConvGRU(width)(hidden, x)
             features.append(x)

@@ -1,6 +1,7 @@
 """ExtraNet (SIGGRAPH Asia 2021), its ablations (Table 7), and ExtraNet with TAA as ExtraSS Table 3 runs it."""
 
 from functools import partial
+from typing import Any
 
 from essjax import methods
 from essjax.interfaces import Method
@@ -17,7 +18,8 @@ PRESETS = {
 }
 
 
-def _stage(config: Config, method: Method, **losses: float) -> Stage:
+def extranet_stage(config: Config, method: Method, **losses: Any) -> Stage:
+    """ExtraNet's training, in the main stage's settings."""
     objective = extranet_objective(method, hole_weight=config.occlusion_weight, **losses)
     decay = partial(cosine, start=FIRST_EPOCHS / EPOCHS)
     return Stage("extranet", method, objective, config.batch, config.learning_rate, main_budget(config), decay)
@@ -27,7 +29,7 @@ def _variant(summary: str, *, parts: tuple[str, ...] = (), shade_weight: float =
     return Variant(
         summary,
         lambda config: methods.extranet(**options),
-        lambda config: [_stage(config, methods.extranet(**options), shade_weight=shade_weight)],
+        lambda config: [extranet_stage(config, methods.extranet(**options), shade_weight=shade_weight)],
         parts=parts,
         presets=PRESETS,
     )

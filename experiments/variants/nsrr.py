@@ -9,22 +9,23 @@ from experiments.config import Config
 from experiments.variants.base import Stage, Variant, main_budget
 
 
-def _nsrr(config: Config) -> Method:
-    return methods.nsrr(config.scale, width=config.width)
+def _nsrr(config: Config, *, half: bool = False) -> Method:
+    return methods.nsrr(config.scale, width=config.width, half=half)
 
 
-def _stages(config: Config) -> list[Stage]:
-    method = _nsrr(config)
+def nsrr_stage(config: Config, *, half: bool = False, within: Method | None = None) -> Stage:
+    """NSRR's training; ``half``: on every other frame; ``within``: a method that holds its variables beside others."""
+    method = _nsrr(config, half=half)
     features = vgg16_features(config.vgg, layers=VGG_LAYERS) if config.vgg else None
-    objective = nsrr_objective(method, vgg_weight=config.vgg_weight, vgg_features=features)
-    return [Stage("nsrr", method, objective, config.batch, config.learning_rate, main_budget(config))]
+    objective = nsrr_objective(method, vgg_weight=config.vgg_weight, vgg_features=features, half=half)
+    return Stage("nsrr", within or method, objective, config.batch, config.learning_rate, main_budget(config))
 
 
 VARIANTS = {
     "nsrr": Variant(
         "NSRR: a U-Net over five frames, supersampling with every frame rendered (twice the input)",
         _nsrr,
-        _stages,
+        lambda config: [nsrr_stage(config)],
         presets={
             "smoke": {"clip": 5},
             "quick": {"clip": 5, "vgg_weight": 0.1, "learning_rate": 1e-3, "seconds": 290.0},

@@ -1,4 +1,4 @@
-"""FASSET's objective on a method whose steps say what they return: every term of eq 2-5 by NumPy."""
+"""FASSET's objective on a method whose steps say what they return: eq 2-5 by NumPy; what ExtraNet+ is trained on."""
 
 import dataclasses
 
@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax.frames import select_time
 from essjax.rollout import ESS, SS
 from essjax.train import fasset_objective
+from essjax.train.objectives.extranet import frame_shading, reference_shading
 from tests.helpers import make_sequence, random_image
 from tests.train.test_objectives import fake
 
@@ -52,3 +54,18 @@ def test_terms_equal_numpy(exact):
         count = round(0.1 * pixels.shape[-1])
         hard = np.sort(pixels, axis=-1)[..., -count:].sum() / pixels.size  # eq 4 divides by all pixels
         np.testing.assert_allclose(terms[f"hard_{name}"], 0.7 * hard, rtol=1e-5)
+
+
+def test_target_of_extranet_plus():
+    """Where base colour is the same everywhere, upsampling changes nothing: the reference over the divisor."""
+    clip = select_time(make_sequence(2, T=1, B=B, H=H, W=W), 0)
+    nowhere = jnp.isfinite(clip.frames.gbuffers.depth)
+    gbuffers = dataclasses.replace(
+        clip.frames.gbuffers,
+        base_color=jnp.full_like(clip.frames.color, 0.3),
+        depth=jnp.where(nowhere, clip.frames.gbuffers.depth, 5.0),
+        metallic=None,
+    )
+    clip = dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, gbuffers=gbuffers))
+    np.testing.assert_allclose(reference_shading(clip), clip.reference / (0.3 + 0.08 * 0.5), rtol=1e-4)
+    np.testing.assert_allclose(frame_shading(clip), clip.frames.color / (0.3 + 0.08 * 0.5), rtol=1e-4)

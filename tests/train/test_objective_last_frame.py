@@ -63,6 +63,37 @@ def test_nsrr_terms_equal_skimage():
     np.testing.assert_allclose(terms["dissimilarity"], 1.0 - np.mean(expected), atol=1e-4)
 
 
+@pytest.mark.parametrize(("length", "rendered"), [(6, 4), (11, 5)])
+def test_nsrr_on_half_of_the_frames(length, rendered):
+    """Of 6 frames 0, 1, 3, 5 are rendered, of the last 9 of 11 every other one."""
+    image, seen = random_image(1, B, 2 * H, 2 * W, 3, high=1.0), []
+
+    def start(example):
+        return jnp.zeros(example.cut.shape)
+
+    def step(kind):
+        def run(variables, history, frame, *, train=False):
+            seen.append((kind, train))
+            return history + (kind == "ss"), Prediction(image=image, aux={"display_image": history})
+
+        return run
+
+    method = Method(lambda key, example: {}, start, step("ss"), step("ess"), MethodInfo("fake", 1))
+    clip = clip_of(length)
+    counted = {}
+
+    def similarity(shown, target):
+        counted["before"] = shown
+        np.testing.assert_array_equal(target, display(clip.reference[-1]))
+        return jnp.zeros(())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("essjax.train.objectives.nsrr.ssim_map", similarity)
+        nsrr_objective(method, half=True)({}, clip)
+    np.testing.assert_array_equal(counted["before"], rendered - 1)
+    assert seen[-1] == ("ss", True) and ("ess", False) in seen
+
+
 def test_nsrr_perceptual_term_is_on_radiance():
     reference = clip_of().reference[-1]
 
