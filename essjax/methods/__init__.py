@@ -1,12 +1,13 @@
 """Methods: each a factory that returns a ``Method``, two pure steps over a history (``essjax.interfaces``)."""
 
 from essjax.methods.baselines import bicubic, bilinear, gaussian_blur, jau, jau_image, warp
+from essjax.methods.classifier import classifier
 from essjax.methods.dlctus import dlctus
 from essjax.methods.extrass import extrass, extrass_e, extrass_w
 from essjax.methods.nsrr import nsrr
 from essjax.methods.taau import gaussian_resample, taa, taau, taau_half
 
 __all__ = [
-    "bicubic", "bilinear", "dlctus", "extrass", "extrass_e", "extrass_w", "gaussian_blur", "gaussian_resample", "jau",
-    "jau_image", "nsrr", "taa", "taau", "taau_half", "warp",
+    "bicubic", "bilinear", "classifier", "dlctus", "extrass", "extrass_e", "extrass_w", "gaussian_blur",
+    "gaussian_resample", "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "warp",
 ]  # fmt: skip

@@ -28,6 +28,13 @@ def mean_pool(image: Image, factor: int = 2) -> Image:
     return blocks.mean(axis=(-4, -2))
 
 
+def max_pool(image: Image, factor: int = 2) -> Image:
+    """Largest value per block and channel; equal ones share the gradient; sizes must be multiples of ``factor``."""
+    *lead, height, width, channels = image.shape
+    blocks = image.reshape(*lead, height // factor, factor, width // factor, factor, channels)
+    return blocks.max(axis=(-4, -2))  # not linen's: on CPUs the gradient of a window reduction is slow
+
+
 def nearest_upsample(image: Image, factor: int = 2) -> Image:
     """Repeat each pixel ``factor`` times in both directions."""
     return jnp.repeat(jnp.repeat(image, factor, axis=-3), factor, axis=-2)
@@ -76,9 +83,9 @@ def conv(features: int, size: int = 3, stride: int = 1, **options) -> nn.Conv:
     return nn.Conv(features, (size, size), (stride, stride), conv_general_dilated=scan_friendly_convolution, **options)
 
 
-def batch_norm(train: bool) -> nn.BatchNorm:
+def batch_norm(train: bool, **options) -> nn.BatchNorm:
     """BatchNorm with PyTorch's defaults: eps 1e-5, running statistics that move by 0.1 towards each batch's."""
-    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)
+    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, **options)
 
 
 class ConvNorm(nn.Module):
