@@ -1,7 +1,8 @@
 """BENCHMARKS.md from ``experiments/results/*.json``.
 
 ``python -m experiments.benchmarks_page`` writes the page; ``... NAME METRICS.json [METRICS.json ...]`` first keeps a
-run, or the same run with several seeds, as ``experiments/results/NAME.json``.
+run (or comparison), or the same run with several seeds, as ``experiments/results/NAME.json``; ``... NAME TABLES.json``
+keeps what ``experiments.tables`` filled in.
 """
 
 import json
@@ -9,6 +10,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from experiments.tables import get_table, markdown
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "experiments" / "results"
@@ -37,6 +40,8 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
     for path, run in zip(paths, runs, strict=True):
         if run.get("schema") != 1:
             raise ValueError(f"{path}: expected schema 1, got {run.get('schema')!r}.")
+        if run.get("kind") == "tables":
+            return _keep_tables(name, paths, run)
         for field in ("variant", "preset", "dataset"):
             if run[field] != runs[0][field]:
                 raise ValueError(
@@ -53,6 +58,14 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
         }
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(merged, indent=1) + "\n")
+    return path
+
+
+def _keep_tables(name: str, paths: Sequence[Path], content: dict[str, Any]) -> Path:
+    if len(paths) > 1:
+        raise ValueError(f"{name}: expected one file of tables, got {len(paths)}.")
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps(content, indent=1) + "\n")
     return path
 
 
@@ -76,7 +89,7 @@ def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def page(results: list[tuple[str, dict[str, Any]]]) -> str:
     """The whole page."""
-    sections = {"import": _import_section}
+    sections = {"import": _import_section, "tables": _tables_section}
     return "\n".join(
         [HEAD, *(sections.get(metrics.get("kind", ""), _section)(name, metrics) for name, metrics in results)]
     )
@@ -100,6 +113,28 @@ def _import_section(name: str, metrics: dict[str, Any]) -> str:
             f"{values['megabytes_per_frame']:.1f} | {memory[len(memory) // 10]:.0f}, {memory[-1]:.0f} |"
         )
     return "\n".join([*lines, ""])
+
+
+def _tables_section(name: str, content: dict[str, Any]) -> str:
+    """The papers' tables on our scenes (experiments/tables)."""
+    lines = [
+        f"## {name}",
+        "",
+        "The tables of the papers with our numbers (bold) next to theirs, `python -m experiments.tables --preset "
+        f"{content['preset']}`. Theirs are of other scenes, longer training and mostly one model per scene: only the "
+        "order of the rows can be compared.",
+        "",
+    ]
+    for run in content["runs"]:
+        environment, settings = run["environment"], " ".join(run["settings"]) or "none"
+        steps = ", ".join(f"{stage} {count}" for stage, count in environment["steps"].items()) or "none"
+        lines += [
+            f"{', '.join(run['tables'])}: {run['dataset']}; settings: {settings}; commit {environment['commit']}; "
+            f"{environment['device']}; jax {environment['versions']['jax']}; seed {environment['seed']}; "
+            f"steps: {steps}.",
+            "",
+        ]
+    return "\n".join([*lines, *(markdown(get_table(key), ours) for key, ours in content["tables"].items())])
 
 
 def _section(name: str, metrics: dict[str, Any]) -> str:

@@ -18,10 +18,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from essjax.data import Dataset
+from essjax.deploy import method_cost
 from experiments import datasets
 from experiments.comparison import Trained, make_runners, notes, table_references
 from experiments.config import Config
-from experiments.evaluate import evaluate, load_clip
+from experiments.evaluate import Runner, evaluate, load_clip
 from experiments.report import print_table, write_report
 from experiments.training import restore_stages, train_stages
 from experiments.variants import stages_of, trained_as
@@ -122,6 +123,7 @@ def run_experiment(
         "environment": environment(config, {name: found.report for name, found in trained.items()}),
         "settings": {name: setting._asdict() for name, setting in settings.items()},
         "seconds": seconds,
+        "costs": costs(runners, dataset),
         "rows": result["rows"],
     }
     remarks = notes(dataset, clips["test"], settings, config)
@@ -182,6 +184,16 @@ def _train_all(
             variables, report = train_stages(stages, dataset, config, folder, on_step)
         trained[base] = Trained(variables, config, report)
     return trained
+
+
+def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str, Any]]:
+    """Method -> parameters, multiply-adds per frame of each kind at this dataset's size, latency in frames."""
+    found = {}
+    for name, runner in runners.items():
+        enlarged = dataset.info.scale if runner.method.info.native else 1
+        cost = method_cost(runner.method, dataset.info.width * enlarged, dataset.info.height * enlarged)
+        found[name] = cost._asdict()
+    return found
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ const DATA = JSON.parse(pick("data").textContent);
 
 function showTables() {
   const chosen = pick("sequence").value;
-  for (const figure of document.querySelectorAll(".scores")) figure.hidden = figure.dataset.sequence !== chosen;
+  for (const figure of document.querySelectorAll(".scores[data-sequence]")) figure.hidden = figure.dataset.sequence !== chosen;
 }
 
 for (const head of document.querySelectorAll("tbody th")) {

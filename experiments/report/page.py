@@ -140,6 +140,7 @@ def _page(
         "sequences": "".join(options),
         "tables": "\n".join(_table(table) for table in tables if table.lines),
         "help": "".join(help_lines),
+        "costs": _costs(metrics.get("costs") or {}),
         # A "</script>" inside the data would end the element that holds it.
         "data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "style": _asset("style.css"),
@@ -202,6 +203,28 @@ def _table(table: Table) -> str:
         f"<figcaption>{table.title}</figcaption><div><table><thead>"
         f'<tr><th rowspan="2" scope="col">method</th>{groups}</tr><tr>{labels}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div></figure>"
+    )
+
+
+def _costs(costs: Mapping[str, Mapping[str, Any]]) -> str:
+    """What each method costs, as a table; nothing where it is not known."""
+    if not costs:
+        return ""
+    body = []
+    for method, cost in costs.items():
+        work = [cost["multiply_adds"].get(kind) for kind in ("ss", "ess")]
+        cells = [f"{cost['parameters']:,}", *("–" if w is None else f"{w / 1e9:.3f}" for w in work), cost["latency"]]
+        body.append(
+            f'<tr><th scope="row">{html.escape(method)}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        )
+    heads = "".join(
+        f'<th scope="col">{name}</th>'
+        for name in ("method", "parameters", "10⁹ multiply-adds, SS", "ESS", "later frames needed")
+    )
+    return (
+        '<figure class="scores"><figcaption>Cost per frame at this size</figcaption><div><table><thead>'
+        f"<tr>{heads}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+        '<p class="lead">Convolutions and matrix products only; warps are not counted.</p></figure>'
     )
 
 

@@ -45,6 +45,25 @@ def test_runs_with_several_seeds_become_mean_and_range(tmp_path, monkeypatch):
         benchmarks_page.keep("mixed", [paths[0], run(tmp_path / "other", 1.0, dataset="other")])
 
 
+def test_tables_are_kept_as_they_are(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
+    environment = {"commit": "abc", "device": "cpu", "seed": 0, "steps": {"a/b": 3}, "versions": {"jax": "1"}}
+    run = {"tables": ["extrass-2"], "settings": ["scale=2"], "dataset": "d", "environment": environment, "seconds": {}}
+    ours = {
+        label: {"PSNR": value}
+        for label, value in zip(("ExtraNet", "IFRNet", "Ours-W", "Ours-E"), (3, 2, 4, 5), strict=True)
+    }
+    content = {"schema": 1, "kind": "tables", "preset": "quick", "runs": [run], "tables": {"extrass-2": ours}}
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "tables.json").write_text(json.dumps(content))
+    benchmarks_page.keep("tables", [tmp_path / "in" / "tables.json"])
+    text = benchmarks_page.current()
+    assert "| Ours-E (`extrass-e`) | 31.80 | 22.00 | 40.06 | 33.29 | 31.79 | **5.00** |" in text
+    assert "the paper's order holds (6 of 6 pairs)" in text and "steps: a/b 3." in text
+    with pytest.raises(ValueError, match="expected one file of tables, got 2"):
+        benchmarks_page.keep("tables", 2 * [tmp_path / "in" / "tables.json"])
+
+
 def test_the_import_benchmark_measures_what_it_says(tmp_path, monkeypatch):
     monkeypatch.setattr(import_benchmark, "WIDTH", 48)
     monkeypatch.setattr(import_benchmark, "HEIGHT", 28)

@@ -36,6 +36,8 @@ def make_metrics():
         "schema": 1, "variant": "extrass", "preset": "quick", "dataset": "built-in scenes", "rows": rows,
         "environment": {"commit": "0123456789abcdef", "device": "cpu", "versions": {"jax": "0.10.2"}, "seed": 3},
         "seconds": {"train": 61.4},
+        "costs": {"extrass": {"parameters": 262141, "multiply_adds": {"ss": 1_500_000_000, "ess": 2_000_000_000},
+                              "latency": 0}, "ifrnet": {"parameters": 7, "multiply_adds": {"ss": 0}, "latency": 1}},
     }  # fmt: skip
 
 
@@ -246,3 +248,9 @@ def test_messages(tmp_path):
     with pytest.raises(ValueError, match=r"frame 6, taau: expected an image \[H, W, 3\], got \(1, 27, 48, 3\)"):
         images = {**entry["images"], "taau": entry["images"]["taau"][None]}
         write_report(tmp_path, make_metrics(), pictures=[{**entry, "images": images}])
+
+
+def test_costs_stand_in_a_table_of_their_own(report):
+    _, page = report
+    assert '<th scope="row">extrass</th><td>262,141</td><td>1.500</td><td>2.000</td><td>0</td>' in page
+    assert '<th scope="row">ifrnet</th><td>7</td><td>0.000</td><td>–</td><td>1</td>' in page

@@ -1,0 +1,86 @@
+"""Every variant on one rendered scene: each stage of its smoke preset trains, and streaming is unrolling."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from essjax.frames import frame_images, select_time, without_color
+from essjax.generate import plan
+from essjax.rollout import SS, alternate, every, stream_step, unroll
+from essjax.train import create_state, make_train_step, optimizer
+from experiments import datasets
+from experiments.config import PRESETS
+from experiments.training import initial_variables, make_batches
+from experiments.variants import VARIANTS, config_of, stages_of
+
+STEPS = 8
+SIZES = ["size=[40,28]", "crop=[32,24]", "test_frames=7", "train_frames=7"]
+TRAINED = [name for name, variant in VARIANTS.items() if variant.stages(PRESETS["smoke"])]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """One family, rendered once for all variants."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(datasets, "plan", functools.partial(plan, families=["carousel"]))
+    config = config_of("extrass", "smoke", SIZES)
+    yield datasets.prepare(config, None, tmp_path_factory.mktemp("every"), lambda n, total: None)
+    patch.undo()
+
+
+def train(name, dataset):
+    """Train every stage of a variant on one batch; stage -> losses, and the variables."""
+    config = config_of(name, "smoke", SIZES)
+    stages, losses = stages_of(name, config), {}
+    variables = initial_variables(stages, dataset, config)
+    for stage in stages:
+        transform = optimizer()
+        step = make_train_step(stage.objective, transform, stage.name)
+        names = [s.name for s in stages[: stages.index(stage) + 1]]
+        state = create_state({entry: variables[entry] for entry in names}, stage.name, transform)
+        batch, losses[stage.name] = next(make_batches(dataset, config, stage)), []
+        for _ in range(STEPS):
+            state, terms = step(state, batch, stage.learning_rate)
+            losses[stage.name].append(float(terms["loss"]))
+        variables = {**variables, **state.variables}
+    return losses, variables
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_the_loss_falls(name, dataset):
+    losses, variables = train(name, dataset)
+    for stage, values in losses.items():
+        assert np.all(np.isfinite(values)), (stage, values)
+        assert min(values[-3:]) < values[0], (stage, values)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(variables))
+
+
+@pytest.mark.parametrize("name", list(VARIANTS))
+def test_streaming_is_unrolling(name, dataset):
+    """Frame by frame with donated history, a cut in between, against one scan."""
+    config = config_of(name, "smoke", SIZES)
+    method = VARIANTS[name].method(config)
+    from essjax.data import disk_source
+
+    sequence = disk_source(dataset, "test", native=method.info.native)[0]
+    frames = sequence.native if method.info.native else sequence.frames
+    frames = jax.tree.map(lambda leaf: jnp.asarray(leaf[:6, None]), frames)
+    frames = frames.__class__(**{**vars(frames), "cut": frames.cut.at[4].set(True)})
+    assert set(method.info.requires) <= set(frame_images(frames))
+    variables = method.init(jax.random.key(3), select_time(frames, 0))
+    schedule = every() if method.info.renders_all else alternate(0)
+    unrolled = jax.jit(lambda v, f: unroll(method, v, f, schedule).image)(variables, frames)
+    kinds = schedule.kinds(6)
+    steps = {kind: stream_step(method, kind) for kind in dict.fromkeys(kinds)}
+    history, images = jax.jit(method.start)(select_time(frames, 0)), []
+    for n, kind in enumerate(kinds):
+        frame = select_time(frames, n)
+        history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
+        images.append(np.asarray(image))
+    late = method.info.latency
+    streamed = np.stack(images[late:] + images[-1:] * late)
+    assert np.ptp(streamed) > 0.01
+    np.testing.assert_allclose(streamed, unrolled, rtol=2e-4, atol=2e-4)
