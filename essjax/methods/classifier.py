@@ -182,10 +182,10 @@ def classifier(
 ) -> Method:
     """Classifier-guided supersampling of a sequence whose frames are all rendered.
 
-    ``variables = {"classifier": ..., "composition": ...}``. ``aux``: ``logits`` ``[..., sH, sW, 6]``, ``ghosting`` and
-    ``aliasing`` probabilities ``[..., 3]`` in the order of ``labels.GHOSTING`` and ``labels.ALIASING``, ``weight``,
-    and x / (1 + x) of the output (``encoded``), of the warped history (``warped``) and ``known``, where there is any.
-    Before training it is close to ``taau``.
+    ``variables = {"classifier": ..., "composition": ...}``; without the second the weight is its prior. ``aux``:
+    ``logits`` ``[..., sH, sW, 6]``, ``ghosting`` and ``aliasing`` probabilities ``[..., 3]`` in the order of
+    ``labels.GHOSTING`` and ``labels.ALIASING``, ``weight``, x / (1 + x) of the output (``encoded``) and of the warped
+    history (``warped``), and ``known``: where there is any. Before training it is close to ``taau``.
 
     Args:
       scale: whole number.
@@ -241,10 +241,11 @@ def classifier(
         rectified = rectify(warped.image, current, ghosting)
         prior = blending_prior(counter, current.samples.weight, alpha)
         classes = jnp.concatenate([ghosting, aliasing], axis=-1)
-        change, _ = composition.apply(
-            variables["composition"], composition_inputs(current, rectified, classes, counter)
-        )
-        weight = jax.nn.sigmoid(_inverse_sigmoid(prior) + change)
+        logit = _inverse_sigmoid(prior)
+        if "composition" in variables:  # not yet where the classifier is trained
+            seen = composition_inputs(current, rectified, classes, counter)
+            logit = logit + composition.apply(variables["composition"], seen)[0]
+        weight = jax.nn.sigmoid(logit)
         image = rectified + weight * (current.color - rectified)
         low = jnp.minimum(current.color, warped.low + RANGE_RATE * (current.color - warped.low))
         high = jnp.maximum(current.color, warped.high + RANGE_RATE * (current.color - warped.high))

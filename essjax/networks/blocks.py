@@ -28,11 +28,17 @@ def mean_pool(image: Image, factor: int = 2) -> Image:
     return blocks.mean(axis=(-4, -2))
 
 
-def max_pool(image: Image, factor: int = 2) -> Image:
-    """Largest value per block and channel; equal ones share the gradient; sizes must be multiples of ``factor``."""
+def max_pool(image: Image) -> Image:
+    """Largest value of each 2 x 2 block, per channel; the sizes must be even.
+
+    By comparisons: linen's is slow to differentiate on CPUs, and the gradient of ``jnp.max`` looks for the value that
+    equals the maximum: where a compiler computes the two differently it finds none and divides by zero.
+    """
     *lead, height, width, channels = image.shape
-    blocks = image.reshape(*lead, height // factor, factor, width // factor, factor, channels)
-    return blocks.max(axis=(-4, -2))  # not linen's: on CPUs the gradient of a window reduction is slow
+    blocks = image.reshape(*lead, height // 2, 2, width // 2, 2, channels)
+    upper, lower = blocks[..., 0, :, :, :], blocks[..., 1, :, :, :]
+    rows = jnp.where(upper > lower, upper, lower)
+    return jnp.where(rows[..., 0, :] > rows[..., 1, :], rows[..., 0, :], rows[..., 1, :])
 
 
 def nearest_upsample(image: Image, factor: int = 2) -> Image:

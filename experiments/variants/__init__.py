@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, extrass
+from experiments.variants import baselines, classifier, extrass
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
+    **classifier.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""

@@ -1,6 +1,10 @@
 """What each stage minimises: ``Objective = (variables, clip) -> ({term: weighted scalar}, statistics)``."""
 
+from essjax.train.objectives.classifier import classification_objective, composition_objective
 from essjax.train.objectives.common import Objective, both_kinds, odd_length
 from essjax.train.objectives.extrass import extrass_objective, frnet_objective
 
-__all__ = ["Objective", "both_kinds", "extrass_objective", "frnet_objective", "odd_length"]
+__all__ = [
+    "Objective", "both_kinds", "classification_objective", "composition_objective", "extrass_objective",
+    "frnet_objective", "odd_length",
+]  # fmt: skip
