@@ -12,10 +12,12 @@ class Config:
 
     Data that the renderer makes (ignored with ``--data``, but for ``clip`` and ``crop``):
       seed, size (width, height), scale, train_sequences / validation_sequences / test_sequences (per family),
-      train_frames (also of validation), test_frames, train_spp (also of validation), test_spp, mip_bias.
+      train_frames (also of validation), test_frames, train_spp (also of validation), test_spp, mip_bias (thesis
+      002: 0 for its dataset 1, -1 for its dataset 2), jitter ("halton", or "dlctus" where every frame is rendered).
     Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
-      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). save_every, the
-      losses' weights of ExtraSS eq 9, 12, 14, vgg (path of VGG-16 weights).
+      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (decay the
+      learning rate also where a paper keeps it), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
+      of VGG-16 weights).
     Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
       scored at the start and after a cut), pictures (chosen frames per sequence).
     optimize: false compiles in half the time for slower code.
@@ -32,6 +34,7 @@ class Config:
     train_spp: int = 16
     test_spp: int = 64
     mip_bias: float = 0.0
+    jitter: str = "halton"
     clip: int = 7
     crop: tuple[int, int] = (48, 48)
     first_batch: int = 4
@@ -44,6 +47,7 @@ class Config:
     first_seconds: float | None = 45.0
     steps: int | None = None
     seconds: float | None = 245.0
+    anneal: bool = True
     save_every: float = 30.0
     feature_weight: float = 0.001
     occlusion_weight: float = 0.3

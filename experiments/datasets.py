@@ -32,7 +32,8 @@ def prepare(
             *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp),
             *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
         ]
-        settings = {"scale": config.scale, "native": True, "mip_bias": config.mip_bias, "ranges": ranges}
+        settings = {"scale": config.scale, "native": True, "mip_bias": config.mip_bias, "jitter": config.jitter}
+        settings["ranges"] = ranges
         dataset = generate(out / "scenes", clips, width, height, progress=progress, **settings)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):

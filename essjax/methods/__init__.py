@@ -4,10 +4,11 @@ from essjax.methods.baselines import bicubic, bilinear, gaussian_blur, jau, jau_
 from essjax.methods.classifier import classifier
 from essjax.methods.dlctus import dlctus
 from essjax.methods.extrass import extrass, extrass_e, extrass_w
+from essjax.methods.fasset import fasset
 from essjax.methods.nsrr import nsrr
-from essjax.methods.taau import gaussian_resample, taa, taau, taau_half
+from essjax.methods.taau import taa, taau, taau_half, tus
 
 __all__ = [
-    "bicubic", "bilinear", "classifier", "dlctus", "extrass", "extrass_e", "extrass_w", "gaussian_blur",
-    "gaussian_resample", "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "warp",
+    "bicubic", "bilinear", "classifier", "dlctus", "extrass", "extrass_e", "extrass_w", "fasset", "gaussian_blur",
+    "jau", "jau_image", "nsrr", "taa", "taau", "taau_half", "tus", "warp",
 ]  # fmt: skip

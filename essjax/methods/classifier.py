@@ -15,11 +15,18 @@ import jax.numpy as jnp
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import Frame, Prediction, depth_scale, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation, reset_at_cut
-from essjax.methods.taau import Resampled, gaussian_resample
 from essjax.networks import classifier_network, composition_network
 from essjax.networks.blocks import nearest_upsample
 from essjax.typing import Array, Color, Flag, Image, Mask, Motion, Plane, pytree
-from essjax.warp import backward_warp, dilate_motion, inside_mask, jitter_aligned_upsample, upsample_motion
+from essjax.warp import (
+    Resampled,
+    backward_warp,
+    dilate_motion,
+    gaussian_resample,
+    inside_mask,
+    jitter_aligned_upsample,
+    upsample_motion,
+)
 
 PRIOR = (-2.0, 1.0, -1.0, 0.0, 0.0, 0.0)
 """Logits before training: history is clamped to the current samples, as TAAU does everywhere."""

@@ -30,7 +30,8 @@ SCALES = (2, 4)
 
 
 def _by_fetches(image: Image, motion: Motion, fetches: int) -> Array:
-    return sample_by_fetches(image, pixel_positions(*motion.shape[-3:-1]) + motion, fetches=fetches)
+    height, width = motion.shape[-3:-1]
+    return sample_by_fetches(image, pixel_positions(height, width) + motion, fetches=fetches)
 
 
 REPROJECTIONS: dict[str, Callable[[Image, Motion], Array]] = {

@@ -30,14 +30,15 @@ from essjax.methods.rendered import (
     reset_memory,
     start_pair,
 )
-from essjax.methods.taau import Resampled, gaussian_resample
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
 from essjax.typing import Array, Color, Image, Jitter, Mask, PyTree, pytree
 from essjax.warp import (
+    Resampled,
     backward_warp,
     depth_to_space,
     dilate_motion,
+    gaussian_resample,
     hole_mask,
     inside_mask,
     space_to_depth,

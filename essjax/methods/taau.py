@@ -1,21 +1,35 @@
-"""Temporal accumulation: TAAU (upsampling), TAAU on half the frames, TAA (native resolution). One code path.
+"""Temporal accumulation: TAAU (upsampling), TAAU on half the frames, TAA (native resolution), TUS. One code path.
 
-Thesis 002 section 2.4, "TUS" (eq 34, 38, 39, 41, 42). All inside x / (1 + x), per channel: as in practice, so that one
-bright sample does not rule a pixel for many frames.
+Thesis 002 section 2.4, "TUS" (eq 34, 38-42). All inside x / (1 + x), per channel: as in practice, so that one bright
+sample does not rule a pixel for many frames.
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
-from essjax.typing import Array, Image, Jitter, Mask, PyTree
-from essjax.warp import backward_warp, dilate_motion, inside_mask, jitter_aligned_upsample, upsample_motion
+from essjax.typing import Array, PyTree
+from essjax.warp import (
+    Resampled,
+    backward_warp,
+    dilate_motion,
+    gaussian_resample,
+    inside_mask,
+    jitter_aligned_upsample,
+    tent_resample,
+    upsample_motion,
+)
 
 CLAMPS = ("none", "rgb", "ycocg")
+RECTIFICATIONS = ("clamp", "clip")
+KERNELS = ("gaussian", "tent")
+ACCUMULATIONS = ("bounded", "constant", "average")
+UPSAMPLED_WEIGHT = 1e-3
+"""What a jitter-aligned upsampled colour counts as where no sample of its frame fell into the pixel (β = 0): history
+that the first sample replaces."""
 
 
 class Settings(NamedTuple):
@@ -25,71 +39,35 @@ class Settings(NamedTuple):
     clamp: str
     dilate: bool
     history_mode: str
+    rectification: str = "clamp"
+    kernel: str = "gaussian"
+    accumulation: str = "bounded"
 
 
-class Resampled(NamedTuple):
-    """A low-resolution frame seen from the output grid.
+def clip_to_box(color: Array, low: Array, high: Array, center: Array) -> Array:
+    """Move ``color`` towards ``center``, which lies in the box, until it is in it too (AABB clipping, section 2.4.4).
 
-    Attributes:
-      color: ``[..., sH, sW, C]`` weighted mean of the nearest samples (eq 38).
-      weight: ``[..., sH, sW, 1]`` the largest unnormalised weight, β (eq 42), in (0, 1].
-      low: ``[..., sH, sW, C]`` smallest of those samples, per channel of the clamp's colour space.
-      high: the largest.
-    """
-
-    color: Array
-    weight: Mask
-    low: Array
-    high: Array
-
-
-def _axis(size: int, scale: int, jitter: Array, sigma: Array) -> tuple[Array, Array]:
-    """Indices and log-weights ``[3, scale * size]`` of the three LR samples next to each output pixel, on one axis."""
-    position = (jnp.arange(size * scale, dtype=jnp.float32) + 0.5) / scale
-    nearest = jnp.clip(jnp.floor(position - jitter), 0, size - 1)
-    index = nearest[None] + jnp.array([[0.0], [-1.0], [1.0]])  # the nearest first: its weight is the largest
-    distance = (index + 0.5 + jitter - position) * scale
-    inside = (index >= 0) & (index < size)
-    log_weight = jnp.where(inside, -0.5 * (distance / sigma) ** 2, -jnp.inf)
-    return jnp.clip(index, 0, size - 1).astype(jnp.int32), log_weight
-
-
-def _resample_one(color: Array, bounded: Array, jitter: Array, sigma: Array, scale: int) -> Resampled:
-    height, width = color.shape[:2]
-    columns, column_log = _axis(width, scale, jitter[0], sigma)
-    rows, row_log = _axis(height, scale, jitter[1], sigma)
-    row_weight = jax.nn.softmax(row_log, axis=0)[..., None, None]
-    column_weight = jax.nn.softmax(column_log, axis=0)[:, None, :, None]
-    # The Gaussian of a grid is a product: rows first, then columns. So are the minimum and the maximum.
-    tall = jnp.sum(color[rows] * row_weight, axis=0)
-    mean = jnp.sum(jnp.moveaxis(tall[:, columns], 1, 0) * column_weight, axis=0)
-    low = bounded[rows].min(axis=0)[:, columns].min(axis=1)
-    high = bounded[rows].max(axis=0)[:, columns].max(axis=1)
-    weight = jnp.exp(row_log[0][:, None, None] + column_log[0][None, :, None])
-    return Resampled(mean, weight, low, high)
-
-
-def gaussian_resample(color: Image, bounded: Image, jitter: Jitter, sigma: Array, scale: int) -> Resampled:
-    """Resample LR samples to the output grid with a Gaussian over the 3 x 3 nearest (thesis 002 eq 38, 41, 42).
+    Unlike a clamp it keeps the direction from the centre, hence the hue.
 
     Args:
-      color: ``[..., H, W, C]``, sampled at pixel centres + ``jitter``.
-      bounded: ``[..., H, W, C]``, the colour in the space whose minimum and maximum are wanted.
-      jitter: ``[..., 2]`` LR pixels.
-      sigma: standard deviation in *output* pixels (our reading: eq 40 measures distance in them), a scalar array.
-      scale: whole number.
+      color: ``[..., C]``.
+      low: ``[..., C]`` smallest corner of the box.
+      high: largest corner.
+      center: where colours move to.
     """
-    leading = color.shape[:-3]
-    flat = [x.reshape(-1, *x.shape[len(leading) :]) for x in (color, bounded, jnp.broadcast_to(jitter, (*leading, 2)))]
-    results = jax.vmap(lambda c, b, j: _resample_one(c, b, j, sigma, scale))(*flat)
-    return jax.tree.map(lambda x: x.reshape(*leading, *x.shape[1:]), results)
+    direction = color - center
+    room = jnp.where(direction > 0, high, low) - center
+    shares = jnp.where(direction == 0, 1.0, room / jnp.where(direction == 0, 1.0, direction))
+    return center + jnp.clip(jnp.min(shares, axis=-1, keepdims=True), 0.0, 1.0) * direction
 
 
-def _clamp(history: Array, resampled: Resampled, clamp: str) -> Array:
-    if clamp == "none":
+def _rectify(history: Array, current: Resampled, settings: Settings) -> Array:
+    if settings.clamp == "none":
         return history
-    encode, decode = (rgb_to_ycocg, ycocg_to_rgb) if clamp == "ycocg" else (lambda x: x, lambda x: x)
-    return decode(jnp.clip(encode(history), resampled.low, resampled.high))
+    encode, decode = (rgb_to_ycocg, ycocg_to_rgb) if settings.clamp == "ycocg" else (lambda x: x, lambda x: x)
+    if settings.rectification == "clip":
+        return decode(clip_to_box(encode(history), current.low, current.high, current.average))
+    return decode(jnp.clip(encode(history), current.low, current.high))
 
 
 def _output_motion(frame: Frame, settings: Settings) -> Array:
@@ -113,15 +91,29 @@ def _reproject(history: PyTree, motion: Array, frame: Frame, settings: Settings)
     return color, jnp.where(expand_flag(frame.cut, count.ndim), 0.0, count)
 
 
+def _blend(count: Array, weight: Array, alpha: Array, settings: Settings) -> tuple[Array, Array]:
+    """α β of eq 39, and the count that remains: the sum of the βs so far, which is N for a box."""
+    if settings.accumulation == "constant":
+        return alpha * weight, jnp.ones_like(count)
+    total = count + weight
+    if settings.accumulation == "bounded":  # α at least 1 / N: a new pixel converges as fast as an average does
+        total = jnp.minimum(total, 1.0 / alpha)
+    if settings.kernel == "tent":
+        total = jnp.maximum(total, UPSAMPLED_WEIGHT)
+    return jnp.minimum(weight / total, 1.0), total
+
+
 def _render_step(settings: Settings, variables: PyTree, history: PyTree, frame: Frame) -> tuple[PyTree, Prediction]:
     color = reinhard(rendered_color(frame, "taau"))
     bounded = rgb_to_ycocg(color) if settings.clamp == "ycocg" else color
-    current = gaussian_resample(color, bounded, frame.jitter, variables["sigma"], settings.scale)
+    if settings.kernel == "tent":
+        current = tent_resample(color, bounded, frame.jitter, settings.scale)
+    else:
+        current = gaussian_resample(color, bounded, frame.jitter, variables["sigma"], settings.scale)
     past, count = _reproject(history, _total_motion(history, frame, settings), frame, settings)
-    # eq 39 with α at least 1 / N, N the sum of the βs so far: a new pixel converges as fast as an average does.
-    total = jnp.minimum(count + current.weight, 1.0 / variables["alpha"])
-    rate = jnp.where(count > 0, jnp.minimum(current.weight / total, 1.0), 1.0)
-    past = _clamp(past, current, settings.clamp)
+    rate, total = _blend(count, current.weight, variables["alpha"], settings)
+    rate = jnp.where(count > 0, rate, 1.0)
+    past = _rectify(past, current, settings)
     image = past + rate * (current.color - past)
     upsampled = jitter_aligned_upsample(color, settings.scale, frame.jitter)
     image = jnp.where(count > 0, image, upsampled)
@@ -138,8 +130,10 @@ def _warp_step(settings: Settings, history: PyTree, frame: Frame) -> tuple[PyTre
 
 
 def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, half: bool, native: bool) -> Method:
-    if settings.clamp not in CLAMPS:
-        raise ValueError(f"clamp: expected one of {', '.join(CLAMPS)}, got {settings.clamp!r}.")
+    choices = {"clamp": CLAMPS, "rectification": RECTIFICATIONS, "kernel": KERNELS, "accumulation": ACCUMULATIONS}
+    for option, allowed in choices.items():
+        if getattr(settings, option) not in allowed:
+            raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {getattr(settings, option)!r}.")
     if settings.scale < 1 or int(settings.scale) != settings.scale:
         raise ValueError(f"scale: expected a whole number >= 1, got {settings.scale!r}.")
     if not (0 < alpha <= 1 and sigma > 0):
@@ -178,13 +172,16 @@ def taau(
     clamp: str = "ycocg",
     dilate: bool = True,
     history_mode: str = "bicubic",
+    rectification: str = "clamp",
+    kernel: str = "gaussian",
+    accumulation: str = "bounded",
 ) -> Method:
     """Temporal upsampling of a sequence that is rendered in every frame: the reference with twice the input.
 
-    Each frame: samples of the current frame are resampled with a Gaussian (eq 38, 41), history is reprojected with
-    dilated motion and clamped to the neighbourhood of the current samples, and both are blended with α β (eq 39, 42).
-    Where there is no history (first frame, cut, off screen) it is the jitter-aligned upsampled frame, and α is at least
-    1 / N (N: accumulated βs), so a new pixel first averages.
+    Each frame: samples of the current frame are resampled (eq 38), history is reprojected with dilated motion and
+    clamped to the neighbourhood of the current samples, and both are blended with α β (eq 39). Where there is no
+    history (first frame, cut, off screen) it is the jitter-aligned upsampled frame, and α is at least 1 / N (N:
+    accumulated βs), so a new pixel first averages.
 
     The defaults are the best of a grid on validation frames (built-in scenes 24.6 dB against 22.4 of ``bilinear`` after
     ``color.display``; chess clip 31.4 against 29.2 after x / (1 + x)). Static scenes want a smaller alpha.
@@ -194,15 +191,20 @@ def taau(
     Args:
       scale: whole number.
       alpha: share of the current sample, (0, 1]; 1 / alpha bounds the effective number of samples (eq 37).
-      sigma: standard deviation of the resampling kernel, output pixels.
+      sigma: standard deviation of the Gaussian, output pixels.
       clamp: "none", "rgb" or "ycocg": history must be in the box from minimum to maximum of the nearest 3 x 3 samples.
       dilate: take motion from the nearest surface of the 3 x 3 neighbourhood, so that silhouettes keep their history.
       history_mode: how history is read, see ``warp.sample``.
+      rectification: "clamp" each channel to that box, or "clip" towards the samples' mean (``clip_to_box``).
+      kernel: "gaussian" (eq 41), β its largest weight (eq 42), or "tent" of one output pixel (eq 40), β 1 in the pixel
+        that a sample fell into and 0 elsewhere.
+      accumulation: "bounded": the larger of α β and β / N, N the sum of the βs; "constant": α β, eq 39 as it is;
+        "average": β / N, without a bound (``alpha`` is not used).
 
     Raises:
-      ValueError: an unknown clamp, or settings out of range.
+      ValueError: an unknown name, or settings out of range.
     """
-    settings = Settings(scale, clamp, dilate, history_mode)
+    settings = Settings(scale, clamp, dilate, history_mode, rectification, kernel, accumulation)
     return _accumulator("taau", settings, alpha, sigma, half=False, native=False)
 
 
@@ -214,13 +216,14 @@ def taau_half(
     clamp: str = "ycocg",
     dilate: bool = True,
     history_mode: str = "bicubic",
+    **options: str,
 ) -> Method:
     """``taau`` on rendered frames only; in between, its last output warped by motion. Same arguments.
 
     The history stays the last *rendered* output, and motion is composed along the path to it: every image, rendered or
     not, is one resampling away from it, however many frames lie between.
     """
-    settings = Settings(scale, clamp, dilate, history_mode)
+    settings = Settings(scale, clamp, dilate, history_mode, **options)
     return _accumulator("taau-half", settings, alpha, sigma, half=True, native=False)
 
 
@@ -231,7 +234,29 @@ def taa(
     clamp: str = "ycocg",
     dilate: bool = True,
     history_mode: str = "bicubic",
+    **options: str,
 ) -> Method:
     """Temporal anti-aliasing of native-resolution frames with their own jitter: ``taau`` at scale 1. Same arguments."""
-    settings = Settings(1, clamp, dilate, history_mode)
+    settings = Settings(1, clamp, dilate, history_mode, **options)
     return _accumulator("taa", settings, alpha, sigma, half=False, native=True)
+
+
+def tus(scale: int = 2, *, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
+    """The TUS row of thesis 002 (section 5.3.1): history clamping, bicubic reprojection (a = -0.75), no dilation.
+
+    Constant α, and history that is started and padded with the jitter-aligned upsampled frame, as in ``dlctus``. Our
+    reading of what is not said: the Gaussian, and the clamp's box in RGB. On the built-in scenes at 2x2 (validation,
+    thesis jitter) it gets 26.0 dB, with the tent 24.6.
+
+    Args:
+      scale: whole number.
+      alpha: share of the current sample; None: 0.5, and 1 for scale 4, as in the thesis.
+      sigma: standard deviation of the Gaussian, output pixels.
+      clamp: see ``taau``.
+
+    Raises:
+      ValueError: see ``taau``.
+    """
+    alpha = (1.0 if scale == 4 else 0.5) if alpha is None else alpha
+    settings = Settings(scale, clamp, False, "bicubic-0.75", accumulation="constant")
+    return _accumulator("tus", settings, alpha, sigma, half=False, native=False)

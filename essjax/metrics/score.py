@@ -12,12 +12,17 @@ from essjax.color import display
 from essjax.losses.pixel import check_same_shape
 from essjax.metrics.psnr import psnr
 from essjax.metrics.ssim import ssim
-from essjax.metrics.temporal import tpsnr, warped_error
+from essjax.metrics.temporal import spatio_temporal_error, tpsnr, warped_error
 from essjax.typing import Array, Color, Mask, Motion
 
-METRICS = ("psnr", "ssim", "psnr_holes", "hole_share", "tpsnr", "warped_error", "warped_error_reference")
-"""Names of what ``score_rollout`` measures, in the order of the tables."""
+METRICS = (
+    "psnr", "ssim", "psnr_holes", "hole_share", "tpsnr", "warped_error", "warped_error_reference", "ssim_dlctus",
+    "spatial_error", "temporal_error",
+)  # fmt: skip
+"""Names of what ``score_rollout`` measures, in the order of the tables. ``ssim_dlctus`` has the constant C2 = 0.02^2 of
+thesis 002 (section 4.3.5) instead of 0.03^2; the last two are its spatio-temporal loss with theta 0 and 1."""
 
+NEED_THE_PREVIOUS_FRAME = ("tpsnr", "warped_error", "warped_error_reference", "spatial_error", "temporal_error")
 MIN_HOLE_PIXELS = 16
 """Frames with fewer hole pixels have no ``psnr_holes``: the PSNR of a handful of pixels is noise."""
 
@@ -41,7 +46,7 @@ def score_rollout(
       holes: ``[T, H, W, 1]``, 1 on disoccluded pixels, at the images' resolution; without it ``psnr_holes`` and
         ``hole_share`` are None and the warped error looks at all pixels.
       motion: ``[T, H, W, 2]`` pixels at the images' resolution, with the jitter difference where the images are
-        jittered; without it the warped errors are None.
+        jittered; without it the errors that follow it are None.
 
     Returns:
       frame index -> ``{"kind": ..., metric: float or None}`` for every name in ``METRICS``: dB for the PSNRs, shares
@@ -74,7 +79,7 @@ def score_rollout(
     for k, n in enumerate(scored):
         values = {name: _number(columns[name][k]) if name in columns else None for name in METRICS}
         if n == 0:
-            values |= dict.fromkeys(("tpsnr", "warped_error", "warped_error_reference"))
+            values |= dict.fromkeys(NEED_THE_PREVIOUS_FRAME)
         rows[n] = {"kind": kinds[n], **values}
     return rows
 
@@ -90,6 +95,7 @@ def _score_frame(batch: tuple[Color, ...], hole: Mask | None, motion: Motion | N
     result = {
         "psnr": psnr(image, target),
         "ssim": ssim(image, target),
+        "ssim_dlctus": ssim(image, target, c2=0.02**2),
         "tpsnr": tpsnr(image, image_before, target, target_before),
     }
     if hole is not None:
@@ -100,6 +106,8 @@ def _score_frame(batch: tuple[Color, ...], hole: Mask | None, motion: Motion | N
         valid = None if hole is None else 1.0 - hole
         result["warped_error"] = warped_error(image, image_before, motion, valid=valid)
         result["warped_error_reference"] = warped_error(target, target_before, motion, valid=valid)
+        for name, theta in (("spatial_error", 0.0), ("temporal_error", 1.0)):
+            result[name] = spatio_temporal_error(image, image_before, target, target_before, motion, theta=theta)
     return result
 
 

@@ -3,7 +3,8 @@
 from essjax.networks.classifier import classifier_network, composition_network
 from essjax.networks.dlctus import dlctus_network
 from essjax.networks.extrassnet import extrassnet
+from essjax.networks.fasset import fasset
 from essjax.networks.frnet import frnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = ["classifier_network", "composition_network", "dlctus_network", "extrassnet", "frnet", "nsrr"]
+__all__ = ["classifier_network", "composition_network", "dlctus_network", "extrassnet", "fasset", "frnet", "nsrr"]

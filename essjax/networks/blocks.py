@@ -148,6 +148,23 @@ def replicated_conv(x: Image, features: int, size: int = 3, **options) -> Image:
     return wide[..., radius:-radius, radius:-radius, :] if radius else wide
 
 
+class Chain(nn.Module):
+    """3x3 convolutions, each followed by a ReLU.
+
+    Attributes:
+      widths: output channels of each.
+    """
+
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x: Image) -> Image:
+        """Return ``[B, H, W, widths[-1]]``."""
+        for width in self.widths:
+            x = nn.relu(conv(width)(x))
+        return x
+
+
 class ConvBlock(nn.Module):
     """``layers`` 3x3 convolutions, each followed by a leaky ReLU.
 

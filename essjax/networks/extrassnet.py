@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from essjax.interfaces import Network
 from essjax.networks.blocks import ConvBlock, conv, crop, mean_pool, nearest_upsample, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen
-from essjax.typing import Image
+from essjax.typing import Callable, Image
 
 LEVELS = 4
 HEAD = 5
@@ -35,10 +35,17 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """From coarse to fine, skips concatenated; returns the head's channels at LR."""
+    """From coarse to fine, skips concatenated; returns the head's channels at LR.
+
+    Attributes:
+      widths: of the encoder's levels, finest first.
+      channels: of the output.
+      head: makes the last layer from ``channels``; by default it returns zero until trained.
+    """
 
     widths: tuple[int, ...]
     channels: int
+    head: Callable[[int], nn.Module] = zero_conv
 
     @nn.compact
     def __call__(self, features: list[Image]) -> Image:
@@ -48,7 +55,7 @@ class Decoder(nn.Module):
             reduced = conv(self.widths[level], 1)(x)  # before upsampling: a quarter of the work
             joined = jnp.concatenate([nearest_upsample(reduced), features[level]], axis=-1)
             x = ConvBlock(self.widths[level], layers=2 if level else 1)(joined)
-        return zero_conv(self.channels)(x)
+        return self.head(self.channels)(x)
 
 
 class ExtraSSNet(nn.Module):

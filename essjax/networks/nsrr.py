@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from essjax.interfaces import Network
-from essjax.networks.blocks import bilinear_upsample, conv, crop, mean_pool, pad_to_multiple, zero_conv
+from essjax.networks.blocks import Chain, bilinear_upsample, conv, crop, mean_pool, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen
 from essjax.typing import Image
 
@@ -17,23 +17,6 @@ PREVIOUS = 4
 RGBD, LEARNED = 4, 8
 FEATURES = RGBD + LEARNED
 """Channels of a frame's features: its colour and depth, then the learned ones."""
-
-
-class Chain(nn.Module):
-    """3x3 convolutions, each followed by a ReLU.
-
-    Attributes:
-      widths: output channels of each.
-    """
-
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, x: Image) -> Image:
-        """Return ``[B, H, W, widths[-1]]``."""
-        for width in self.widths:
-            x = nn.relu(conv(width)(x))
-        return x
 
 
 class Reweighting(nn.Module):

@@ -7,7 +7,9 @@ from essjax.train.objectives import (
     both_kinds,
     classification_objective,
     composition_objective,
+    dlctus_objective,
     extrass_objective,
+    fasset_objective,
     frnet_objective,
     odd_length,
 )
@@ -16,7 +18,7 @@ from essjax.train.step import make_train_step
 
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds",
-    "classification_objective", "composition_objective", "constant",
-    "cosine", "create_state", "extrass_objective", "frnet_objective", "halving", "learning_rate", "make_train_step",
+    "classification_objective", "composition_objective", "constant", "cosine", "create_state", "dlctus_objective",
+    "extrass_objective", "fasset_objective", "frnet_objective", "halving", "learning_rate", "make_train_step",
     "odd_length", "optimizer", "train",
 ]  # fmt: skip

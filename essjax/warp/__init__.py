@@ -6,9 +6,11 @@ centres lie at +0.5. All functions may be jitted, vmapped and differentiated.
 
 from essjax.warp.backward import backward_warp
 from essjax.warp.fetches import sample_by_fetches
+from essjax.warp.fill import fill_holes
 from essjax.warp.gbuffer_guided import candidate_offsets, gbuffer_guided_warp, guided_weights, guides
 from essjax.warp.motion import compose_motion, dilate_motion, jittered_motion, upsample_motion
 from essjax.warp.occlusion import hole_mask, occlusion_motion
+from essjax.warp.resample import Resampled, gaussian_resample, tent_resample
 from essjax.warp.sampling import inside_mask, sample
 from essjax.warp.splat import splat, splat_nearest
 from essjax.warp.upsample import (
@@ -21,8 +23,9 @@ from essjax.warp.upsample import (
 )
 
 __all__ = [
-    "backward_warp", "candidate_offsets", "compose_motion", "depth_to_space", "dilate_motion", "gbuffer_guided_warp",
-    "guided_weights", "guides", "hole_mask", "inside_mask", "jitter_aligned_upsample", "jittered_motion",
-    "occlusion_motion", "sample", "sample_by_fetches", "sample_distance", "sample_zero_upsampled", "space_to_depth",
-    "splat", "splat_nearest", "upsample_motion", "zero_upsample",
+    "Resampled", "backward_warp", "candidate_offsets", "compose_motion", "depth_to_space", "dilate_motion",
+    "fill_holes", "gaussian_resample", "gbuffer_guided_warp", "guided_weights", "guides", "hole_mask", "inside_mask",
+    "jitter_aligned_upsample", "jittered_motion", "occlusion_motion", "sample", "sample_by_fetches",
+    "sample_distance", "sample_zero_upsampled", "space_to_depth", "splat", "splat_nearest", "tent_resample",
+    "upsample_motion", "zero_upsample",
 ]  # fmt: skip

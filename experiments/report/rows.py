@@ -151,7 +151,7 @@ def resolutions(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def headline(metrics: Mapping[str, Any], references: Mapping[str, str] | None = None) -> str:
-    """One sentence: what the variant reached, and how far the best comparable other method is from it."""
+    """One sentence: what the variant reached, and how far the best other method on the same terms is from it."""
     references = references or {}
     variant, parts = metrics["variant"], []
     for resolution in resolutions(metrics):
@@ -165,7 +165,8 @@ def headline(metrics: Mapping[str, Any], references: Mapping[str, str] | None = 
             if variant not in scores:
                 continue
             part = f"{scores[variant]:.2f} dB on {KIND_NAMES[kind].split(' (')[0]} frames"
-            others = {m: v for m, v in scores.items() if m != variant and m not in references}
+            terms = references.get(variant)
+            others = {m: v for m, v in scores.items() if m != variant and references.get(m) == terms}
             if others:
                 rival = max(others, key=others.__getitem__)
                 part += f" ({scores[variant] - others[rival]:+.2f} against {rival})"

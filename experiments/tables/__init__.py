@@ -1,9 +1,10 @@
 """The papers' tables that can be rebuilt on our scenes, one module per paper."""
 
-from experiments.tables import extranet, extrass, fasset
+from experiments.tables import dlctus, extranet, extrass, fasset
 from experiments.tables.base import Table, check, markdown, measured, variants, verdict
 
-TABLES: dict[str, Table] = {table.name: table for module in (extrass, extranet, fasset) for table in module.TABLES}
+_MODULES = (extrass, extranet, fasset, dlctus)
+TABLES: dict[str, Table] = {table.name: table for module in _MODULES for table in module.TABLES}
 """Every table by name."""
 
 for _table in TABLES.values():

@@ -39,8 +39,8 @@ def _tables(options: argparse.Namespace, console: Console) -> int:
     chosen = [tables.get_table(name) for name in dict.fromkeys(options.names or tables.TABLES)]
     out = Path(options.out or f"runs/tables-{options.preset}")
     results: dict[str, Any] = {"schema": 1, "kind": "tables", "preset": options.preset, "runs": [], "tables": {}}
-    for number, settings in enumerate(dict.fromkeys(table.settings for table in chosen)):
-        group = [table for table in chosen if table.settings == settings]
+    for number, same in enumerate(dict.fromkeys((table.settings, table.half_input) for table in chosen)):
+        group = [table for table in chosen if (table.settings, table.half_input) == same]
         run, filled = _fill(group, options, out / f"group-{number}", console)
         results["runs"].append(run)
         results["tables"] |= filled
@@ -60,7 +60,7 @@ def _fill(group: list, options: argparse.Namespace, out: Path, console: Console)
     from experiments.variants import VARIANTS, config_of
 
     names = list(dict.fromkeys(name for table in group for name in tables.variants(table)))
-    overrides = [*group[0].settings, *options.overrides]
+    overrides = [*group[0].settings, *(_halved(options.preset) if group[0].half_input else []), *options.overrides]
     costs = {}
     for table in group:
         if any((metric.key or "").startswith("cost.") for metric in table.metrics.values()):
@@ -76,6 +76,16 @@ def _fill(group: list, options: argparse.Namespace, out: Path, console: Console)
         {"tables": [table.name for table in group], "settings": overrides, **{key: metrics[key] for key in keys}},
         {table.name: tables.measured(table, metrics, costs) for table in group},
     )
+
+
+def _halved(preset: str) -> list[str]:
+    """Half the preset's size and crop, no smaller than a crop may be."""
+    from experiments.config import make_config
+    from experiments.training import MIN_CROP
+
+    config = make_config(preset, [])
+    sizes = {key: [max(n // 2, MIN_CROP) for n in getattr(config, key)] for key in ("size", "crop")}
+    return [f"{key}=[{width},{height}]" for key, (width, height) in sizes.items()]
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ class Table(NamedTuple):
       rows: label -> what stands behind it here.
       paper: row label -> metric label -> the paper's number per scene (None: not given).
       settings: ``--set`` of the comparison behind it, beyond the preset.
+      half_input: size and crop are half the preset's (4x4 upsampling to the preset's output).
       note: what a reader must know, one or two sentences.
     """
 
@@ -64,6 +65,7 @@ class Table(NamedTuple):
     rows: Mapping[str, Row]
     paper: Mapping[str, Mapping[str, tuple[float | None, ...]]]
     settings: tuple[str, ...] = ()
+    half_input: bool = False
     note: str = ""
 
 

@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, classifier, extrass
+from experiments.variants import baselines, classifier, dlctus, extrass, fasset
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
+    **fasset.VARIANTS,
+    **dlctus.VARIANTS,
     **classifier.VARIANTS,
     **baselines.VARIANTS,
 }
@@ -15,8 +17,9 @@ VARIANTS: dict[str, Variant] = {
 
 BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "taau-half", "taau", "taa")
 """Rows of every table."""
+EVERY_FRAME = "gets every frame rendered: twice the input"
 REFERENCES = {
-    "taau": "gets every frame rendered: twice the input",
+    **dict.fromkeys(("taau", "tus", *dlctus.VARIANTS, *classifier.VARIANTS), EVERY_FRAME),
     "taa": "gets every frame rendered at native resolution: eight times the input",
 }
 """Rows that are not on equal terms, and why."""

@@ -11,6 +11,11 @@ VARIANTS = {
     "bilinear": Variant("bilinear upscaling of each rendered frame", lambda c: methods.bilinear(c.scale)),
     "bicubic": Variant("bicubic upscaling of each rendered frame", lambda c: methods.bicubic(c.scale)),
     "jau": Variant("jitter-aligned bilinear upscaling", lambda c: methods.jau(c.scale)),
+    "jau-bicubic": Variant("jitter-aligned bicubic upscaling", lambda c: methods.jau(c.scale, mode="bicubic")),
+    "tus": Variant(
+        "temporal upsampling with the settings of the DLCTUS thesis, every frame rendered",
+        lambda c: methods.tus(c.scale),
+    ),
     "taau": Variant(
         "temporal anti-aliasing with upsampling on every frame (twice the input)",
         lambda c, **settings: methods.taau(c.scale, **settings),

@@ -107,4 +107,7 @@ def test_the_command_fills_a_table(tmp_path, monkeypatch, capsys):
     assert asked["names"] == ["extrass", "taau"] and asked["overrides"] == ["scale=4", "steps=3"]
     content = json.loads((tmp_path / "tables.json").read_text())
     assert content["tables"]["toy-1"]["ours"]["PSNR"] == 25.0 and content["runs"][0]["tables"] == ["toy-1"]
+    monkeypatch.setitem(tables.TABLES, "toy-1", TOY._replace(half_input=True))
+    assert main(["toy-1", "--preset", "paper", "--out", str(tmp_path)]) == 0
+    assert asked["overrides"] == ["size=[480,270]", "crop=[64,64]"]
     assert "**25.00**" in (tmp_path / "tables.md").read_text() and "toy-1" in capsys.readouterr().out

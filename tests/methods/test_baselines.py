@@ -3,12 +3,10 @@
 import dataclasses
 import functools
 
-import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from PIL import Image as Pillow
 
 from essjax import methods
@@ -223,36 +221,6 @@ def test_warp_blur():
     np.testing.assert_allclose(shown[1], methods.gaussian_blur(frames.color[0], 0.5), rtol=1e-5)
     with pytest.raises(ValueError, match="blur: expected a standard deviation >= 0 in pixels, got -1"):
         methods.warp(blur=-1)
-
-
-@functools.partial(jax.jit, static_argnums=3)
-def resample(color, jitter, sigma, scale):
-    return methods.gaussian_resample(color, color, jitter, sigma, scale)
-
-
-@pytest.mark.parametrize("scale", [1, 2, 4])
-@settings(max_examples=5)
-@given(seed=st.integers(0, 2**16))
-def test_gaussian_resample_against_brute_force(scale, seed):
-    H, W, sigma = 3, 4, 0.7
-    color, jitter = random_image(seed, H, W, 2), random_image(seed, 2, low=-0.5, high=0.5)
-    got = resample(color, jitter, jnp.float32(sigma), scale)
-    j = np.asarray(jitter)
-    for y in range(H * scale):
-        for x in range(W * scale):
-            px, py = (x + 0.5) / scale, (y + 0.5) / scale
-            cx, cy = (int(np.clip(np.floor(p - o), 0, n - 1)) for p, o, n in ((px, j[0], W), (py, j[1], H)))
-            near = [(v, u) for v in range(cy - 1, cy + 2) for u in range(cx - 1, cx + 2) if 0 <= v < H and 0 <= u < W]
-            weights, samples = [], []
-            for v, u in near:
-                distance = scale * np.hypot(u + 0.5 + j[0] - px, v + 0.5 + j[1] - py)
-                weights.append(np.exp(-(distance**2) / (2 * sigma**2)))
-                samples.append(np.asarray(color)[v, u])
-            mean = np.average(samples, axis=0, weights=weights)
-            np.testing.assert_allclose(got.color[y, x], mean, rtol=1e-4)
-            np.testing.assert_allclose(got.weight[y, x, 0], max(weights), rtol=1e-4)
-            np.testing.assert_allclose(got.low[y, x], np.min(samples, axis=0))
-            np.testing.assert_allclose(got.high[y, x], np.max(samples, axis=0))
 
 
 STATIC = {"alpha": 0.05, "sigma": 0.4}

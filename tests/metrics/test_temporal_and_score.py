@@ -79,6 +79,10 @@ def test_score_rollout_matches_numpy(rollout):
         assert row["warped_error"] == pytest.approx(np.abs(images[n] - images[n - 1])[valid].mean(), rel=1e-4)
         expected = np.abs(targets[n] - targets[n - 1])[valid].mean()
         assert row["warped_error_reference"] == pytest.approx(expected, rel=1e-4)
+        assert row["ssim"] - 0.2 < row["ssim_dlctus"] < row["ssim"]  # the smaller constant forgives less
+        x, y = images[n] - targets[n], images[n - 1] - targets[n - 1]  # nothing moves
+        assert row["spatial_error"] == pytest.approx((np.abs(x) + np.abs(y)).mean(), rel=1e-4)
+        assert row["temporal_error"] == pytest.approx(np.abs(x - y).mean(), rel=1e-4)
         assert row["hole_share"] == pytest.approx(1 - valid.mean(), rel=1e-5)
     error = (images[3] - targets[3])[2:8, 3:7] ** 2
     assert rows[3]["psnr_holes"] == pytest.approx(-10 * np.log10(error.mean()), rel=1e-4)

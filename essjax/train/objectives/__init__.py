@@ -2,9 +2,11 @@
 
 from essjax.train.objectives.classifier import classification_objective, composition_objective
 from essjax.train.objectives.common import Objective, both_kinds, odd_length
+from essjax.train.objectives.dlctus import dlctus_objective
 from essjax.train.objectives.extrass import extrass_objective, frnet_objective
+from essjax.train.objectives.fasset import fasset_objective
 
 __all__ = [
-    "Objective", "both_kinds", "classification_objective", "composition_objective", "extrass_objective",
-    "frnet_objective", "odd_length",
+    "Objective", "both_kinds", "classification_objective", "composition_objective", "dlctus_objective",
+    "extrass_objective", "fasset_objective", "frnet_objective", "odd_length",
 ]  # fmt: skip

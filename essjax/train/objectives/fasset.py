@@ -1,0 +1,40 @@
+"""What FASSET's training minimises (section 3.4): every inner frame of a clip as SS and as ESS, see ``both_kinds``."""
+
+import jax.numpy as jnp
+
+from essjax.color import log1p
+from essjax.frames import Sequence
+from essjax.interfaces import Method
+from essjax.losses import hardest, l1, masked_mean, occlusion
+from essjax.networks.blocks import nearest_upsample
+from essjax.train.objectives.common import Objective, both_kinds, odd_length
+from essjax.typing import Array, PyTree
+
+
+def fasset_objective(
+    method: Method, *, hole_weight: float = 5.0, hard_weight: float = 1.0, share: float = 0.1
+) -> Objective:
+    """L of FASSET eq 5 on log(1 + x), against the anti-aliased reference.
+
+    Args:
+      method: ``fasset`` at the reference's scale.
+      hole_weight: W_hole of eq 5. Holes are the renderer's exact ones, else the network's own, at output size.
+      hard_weight: W_hard of eq 5; eq 4 divides by all pixels, not by k.
+      share: k of eq 4 over the number of pixels.
+    """
+
+    def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
+        clip = odd_length(clip)
+        kinds, state = both_kinds(method, variables, clip, lambda aux: {k: aux[k] for k in ("log_image", "valid")})
+        target = log1p(clip.reference[1:-1])
+        terms: dict[str, Array] = {}
+        for kind, predicted in kinds.items():
+            errors = l1(predicted["log_image"], target)
+            valid = predicted["valid"] if clip.valid is None else clip.valid[1:-1]
+            hole = 1.0 - nearest_upsample(valid, clip.scale)
+            terms[f"l1_{kind}"] = jnp.mean(errors)
+            terms[f"hole_{kind}"] = hole_weight * masked_mean(occlusion(predicted["log_image"], target, hole), hole)
+            terms[f"hard_{kind}"] = hard_weight * jnp.mean(errors * hardest(errors, share=share))
+        return terms, state
+
+    return objective

@@ -1,0 +1,101 @@
+"""A low-resolution frame resampled to the output grid, with what temporal accumulation must know of its samples."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from essjax.typing import Array, Image, Jitter, Mask
+from essjax.warp.upsample import zero_upsample
+
+
+class Resampled(NamedTuple):
+    """A low-resolution frame seen from the output grid.
+
+    Attributes:
+      color: ``[..., sH, sW, C]`` weighted mean of the nearest samples (eq 38).
+      weight: ``[..., sH, sW, 1]`` β: the largest unnormalised weight (eq 42), or 1 where a sample is in the pixel.
+      low: ``[..., sH, sW, C]`` smallest of those samples, per channel of the clamp's colour space.
+      high: the largest.
+      average: their unweighted mean.
+    """
+
+    color: Array
+    weight: Mask
+    low: Array
+    high: Array
+    average: Array
+
+
+def _nearest_three(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Array]:
+    """Indices ``[3, scale * size]`` of the LR samples next to each output pixel on one axis, the nearest first.
+
+    Returns:
+      The indices, which may lie one outside; the distance to them in output pixels; whether they are inside.
+    """
+    position = (jnp.arange(size * scale, dtype=jnp.float32) + 0.5) / scale
+    nearest = jnp.clip(jnp.floor(position - jitter), 0, size - 1)
+    index = nearest[None] + jnp.array([[0.0], [-1.0], [1.0]])
+    distance = (index + 0.5 + jitter - position) * scale
+    return index, distance, (index >= 0) & (index < size)
+
+
+def _gaussian_axis(size: int, scale: int, jitter: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    """Indices, normalised weights, and the logarithm of the largest weight before normalisation."""
+    index, distance, inside = _nearest_three(size, scale, jitter)
+    log_weight = jnp.where(inside, -0.5 * (distance / sigma) ** 2, -jnp.inf)
+    return index, jax.nn.softmax(log_weight, axis=0), log_weight[0]
+
+
+def _tent_axis(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Array]:
+    """Indices and normalised weights (0 where no sample is within a pixel); no logarithm is needed."""
+    index, distance, inside = _nearest_three(size, scale, jitter)
+    weight = jnp.where(inside, jnp.maximum(1.0 - jnp.abs(distance), 0.0), 0.0)
+    total = weight.sum(axis=0)
+    return index, weight / jnp.where(total > 0, total, 1.0), jnp.zeros_like(total)
+
+
+def _resample_one(color: Array, bounded: Array, jitter: Array, axis: Callable) -> Resampled:
+    height, width = color.shape[:2]
+    columns, column_weight, column_log = axis(width, jitter[0])
+    rows, row_weight, row_log = axis(height, jitter[1])
+    columns = jnp.clip(columns, 0, width - 1).astype(jnp.int32)
+    rows = jnp.clip(rows, 0, height - 1).astype(jnp.int32)
+    # The kernel of a grid is a product: rows first, then columns. So are the minimum, the maximum and the mean.
+    tall = jnp.sum(color[rows] * row_weight[..., None, None], axis=0)
+    mean = jnp.sum(jnp.moveaxis(tall[:, columns], 1, 0) * column_weight[:, None, :, None], axis=0)
+    near = bounded[rows]
+    low, high, average = near.min(axis=0), near.max(axis=0), near.mean(axis=0)
+    low, high, average = low[:, columns].min(axis=1), high[:, columns].max(axis=1), average[:, columns].mean(axis=1)
+    weight = jnp.exp(row_log[:, None, None] + column_log[None, :, None])
+    return Resampled(mean, weight, low, high, average)
+
+
+def _resample(color: Image, bounded: Image, jitter: Jitter, axis: Callable) -> Resampled:
+    leading = color.shape[:-3]
+    flat = [x.reshape(-1, *x.shape[len(leading) :]) for x in (color, bounded, jnp.broadcast_to(jitter, (*leading, 2)))]
+    results = jax.vmap(lambda c, b, j: _resample_one(c, b, j, axis))(*flat)
+    return jax.tree.map(lambda x: x.reshape(*leading, *x.shape[1:]), results)
+
+
+def gaussian_resample(color: Image, bounded: Image, jitter: Jitter, sigma: Array, scale: int) -> Resampled:
+    """Resample LR samples to the output grid with a Gaussian over the 3 x 3 nearest (thesis 002 eq 38, 41, 42).
+
+    Args:
+      color: ``[..., H, W, C]``, sampled at pixel centres + ``jitter``.
+      bounded: ``[..., H, W, C]``, the colour in the space whose minimum and maximum are wanted.
+      jitter: ``[..., 2]`` LR pixels.
+      sigma: standard deviation in *output* pixels (our reading: eq 40 measures distance in them), a scalar array.
+      scale: whole number.
+    """
+    return _resample(color, bounded, jitter, lambda size, j: _gaussian_axis(size, scale, j, sigma))
+
+
+def tent_resample(color: Image, bounded: Image, jitter: Jitter, scale: int) -> Resampled:
+    """Resample with a tent of one output pixel (eq 38, 40); β is 1 in the pixel that a sample fell into, else 0.
+
+    The colour is 0 where no sample is within a pixel, as is β there. Arguments as ``gaussian_resample``.
+    """
+    resampled = _resample(color, bounded, jitter, lambda size, j: _tent_axis(size, scale, j))
+    return resampled._replace(weight=zero_upsample(jnp.ones_like(color[..., :1]), scale, jitter))
