@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import Frame, Prediction, depth_scale, rendered_color
-from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation, reset_at_cut
+from essjax.interfaces import Method, MethodInfo, Network, expand_flag, refuse_extrapolation, reset_at_cut
 from essjax.networks import classifier_network, composition_network
 from essjax.networks.blocks import nearest_upsample
 from essjax.typing import Array, Color, Flag, Image, Mask, Motion, Plane, pytree
@@ -28,8 +28,8 @@ from essjax.warp import (
     upsample_motion,
 )
 
-PRIOR = (-2.0, 1.0, -1.0, 0.0, 0.0, 0.0)
-"""Logits before training: history is clamped to the current samples, as TAAU does everywhere."""
+PRIOR = (-2.0, -1.0, 1.0, -0.5, 0.0, 0.5)
+"""Logits before training, about as often as the classes are: most pixels keep their history."""
 RANGE_RATE = 0.1
 """How fast the colour range of the history shrinks towards the current colour, per frame."""
 
@@ -184,15 +184,20 @@ def _inverse_sigmoid(share: Array) -> Array:
     return jnp.log(share) - jnp.log1p(-share)
 
 
+def classification_network(width: int = 32) -> Network:
+    """The classification network of ``classifier(width=width)``."""
+    return classifier_network(width, prior=PRIOR)
+
+
 def classifier(
-    scale: int = 2, *, width: int = 32, composition_width: int = 64, alpha: float = 0.7, sigma: float = 0.8
+    scale: int = 2, *, width: int = 32, composition_width: int = 64, alpha: float = 0.5, sigma: float = 0.8
 ) -> Method:
     """Classifier-guided supersampling of a sequence whose frames are all rendered.
 
-    ``variables = {"classifier": ..., "composition": ...}``; without the second the weight is its prior. ``aux``:
-    ``logits`` ``[..., sH, sW, 6]``, ``ghosting`` and ``aliasing`` probabilities ``[..., 3]`` in the order of
-    ``labels.GHOSTING`` and ``labels.ALIASING``, ``weight``, x / (1 + x) of the output (``encoded``) and of the warped
-    history (``warped``), and ``known``: where there is any. Before training it is close to ``taau``.
+    ``variables = {"classifier": ..., "composition": ...}``; without the second the weight is its prior. ``aux``: the
+    classifier's ``inputs`` and ``logits`` ``[..., sH, sW, 6]``, ``ghosting`` and ``aliasing`` probabilities (3 each)
+    in the order of ``labels.GHOSTING`` and ``labels.ALIASING``, ``weight``, x / (1 + x) of the output (``encoded``) and
+    of the warped history (``warped``), and ``known``: where there is any. Before training it is close to ``taau``.
 
     Args:
       scale: whole number.
@@ -201,7 +206,7 @@ def classifier(
       alpha: smallest share of a sample on its own output pixel, before training.
       sigma: of the Gaussian that says how near a sample is, output pixels.
     """
-    network, composition = classifier_network(width, prior=PRIOR), composition_network(composition_width)
+    network, composition = classification_network(width), composition_network(composition_width)
 
     def start(example: Frame) -> History:
         *lead, height, low_width, _ = example.motion.shape
@@ -267,8 +272,8 @@ def classifier(
             empty=jnp.zeros_like(history.empty),
         )
         aux = {
-            "logits": logits, "ghosting": ghosting, "aliasing": aliasing, "weight": weight, "encoded": image,
-            "warped": warped.image, "known": warped.known,
+            "inputs": inputs, "logits": logits, "ghosting": ghosting, "aliasing": aliasing, "weight": weight,
+            "encoded": image, "warped": warped.image, "known": warped.known,
         }  # fmt: skip
         states = {"classifier": state} if state else {}
         return new, Prediction(image=reinhard_inverse(image), aux=aux, state=states)

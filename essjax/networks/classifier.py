@@ -28,6 +28,9 @@ SCALES = 4
 LOGITS = 6
 """Three of ghosting, three of aliasing (``labels.GHOSTING``, ``labels.ALIASING``)."""
 
+LOGIT_SCALE = 0.3
+"""Standard deviation of the logits around their prior, before training."""
+
 
 class Bottleneck(nn.Module):
     """1x1 convolution, depthwise 3x3, 1x1; BatchNorm and ReLU after the 1x1s only.
@@ -74,8 +77,9 @@ class Classifier(nn.Module):
         x = jnp.concatenate(merged, axis=-1)
         for _ in range(3):
             x = ConvNorm(self.width, 1)(x, train)
-        # A scale of zero: the first logits are the prior, whatever the layers before hold.
-        last = batch_norm(train, scale_init=nn.initializers.zeros, bias_init=lambda *_: jnp.asarray(self.prior))
+        # A small scale: the first logits are near the prior. From zero it would take the optimiser hundreds of steps.
+        scale = nn.initializers.constant(LOGIT_SCALE)
+        last = batch_norm(train, scale_init=scale, bias_init=lambda *_: jnp.asarray(self.prior))
         x = conv(LOGITS, 1)(x)
         logits = last(x)
         return crop(bilinear_upsample(logits), height, width)

@@ -103,13 +103,13 @@ def test_the_classifier_equals_numpy(network):
         np.testing.assert_allclose(got[b], forward(np.asarray(image[b]), variables), rtol=1e-3, atol=1e-3)
 
 
-def test_before_training_the_logits_are_the_prior(network):
+def test_before_training_the_logits_are_near_the_prior(network):
     made, variables = network
     image = random_image(2, 1, 16, 16, CHANNELS)
-    for train in (False, True):
-        logits, state = jax.jit(partial(made.apply, train=train))(variables, image)
-        np.testing.assert_allclose(logits, np.broadcast_to(PRIOR, logits.shape), rtol=1e-6)
-        assert set(state) == ({"batch_stats"} if train else set())
+    logits, state = jax.jit(partial(made.apply, train=True))(variables, image)
+    np.testing.assert_allclose(logits.mean(axis=(0, 1, 2)), PRIOR, atol=0.1)
+    assert 0.05 < float(logits.std(axis=(0, 1, 2)).max()) < 0.4
+    assert set(state) == {"batch_stats"}
 
 
 def test_size_at_the_papers_width():

@@ -1,10 +1,11 @@
 """What classifier-guided supersampling minimises: first the classifier, on automatic labels, then the blending."""
 
+import jax
 import jax.numpy as jnp
 
 from essjax.color import reinhard
 from essjax.frames import SampleRanges, Sequence
-from essjax.interfaces import Method
+from essjax.interfaces import Method, Network
 from essjax.labels import ALIASING, DEFAULTS, GHOSTING, Thresholds, label_sequence
 from essjax.losses import class_weights, cross_entropy, l1, masked_mean, temporal_l1
 from essjax.networks.blocks import nearest_upsample
@@ -23,29 +24,37 @@ def required_ranges(clip: Sequence) -> SampleRanges:
     return clip.ranges
 
 
-def classification_objective(method: Method, *, thresholds: Thresholds = DEFAULTS, balance: float = 0.5) -> Objective:
-    """Cross-entropy of both classes against automatic labels, over every frame but the first, classes balanced.
+def classification_objective(
+    method: Method, network: Network, *, thresholds: Thresholds = DEFAULTS, balance: float = 0.25
+) -> Objective:
+    """Cross-entropy of both classes against automatic labels, classes balanced.
 
-    The history is the method's own, so that counter, ranges and previous logits are those of inference. Pixels
+    First the method runs over the clip, as it does at inference; what its classifier saw is then classified again, all
+    frames as one batch. Counter, ranges and previous logits so are those of inference, and BatchNorm's statistics are
+    of all frames: frame by frame they would remove what is the same everywhere in a frame, such as the counter. Pixels
     without history are left out: they are visibility ghosting whatever the network says.
 
     Args:
       method: ``classifier``.
+      network: its classification network.
       thresholds: of the labels; ``Thresholds.of_height`` of the whole image, not of the crop.
       balance: see ``losses.class_weights``.
     """
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         labels = label_sequence(required_ranges(clip), clip.frames.cut, thresholds)
-        keep = lambda aux: {"logits": aux["logits"], "known": aux["known"]}  # noqa: E731
-        rollout = unroll(method, variables, clip.frames, every(), train=True, keep=keep)
-        logits, known = (rollout.aux[SS][name][1:] for name in ("logits", "known"))
+        keep = lambda aux: {"inputs": aux["inputs"], "known": aux["known"]}  # noqa: E731
+        given = jax.lax.stop_gradient(variables)
+        seen = jax.lax.stop_gradient(unroll(method, given, clip.frames, every(), keep=keep).aux[SS])
+        inputs = seen["inputs"].reshape(-1, *seen["inputs"].shape[-3:])
+        logits, state = network.apply(variables["classifier"], inputs, train=True)
+        logits = logits.reshape(*seen["known"].shape[:-1], -1)
         terms = {}
         for name, part, names in (("ghosting", logits[..., :3], GHOSTING), ("aliasing", logits[..., 3:], ALIASING)):
-            classes = getattr(labels, name)[1:]
-            weight = class_weights(classes, len(names), known, balance=balance)
+            classes = getattr(labels, name)
+            weight = class_weights(classes, len(names), seen["known"], balance=balance)
             terms[name] = masked_mean(cross_entropy(part, classes), weight)
-        return terms, rollout.state
+        return terms, {"classifier": state}
 
     return objective
 
