@@ -121,8 +121,7 @@ def _unlike(closeness: Plane, velocity: Array, other_closeness: Plane, other_vel
 def visibility_ghosting(ranges: SampleRanges, previous: SampleRanges, at: Thresholds = DEFAULTS) -> Marks:
     """Pixels whose history shows a closer surface that moves otherwise (eq 1 and 2), or is off screen.
 
-    Then dilated by a pixel (eq 3 and 4): onto the boundary pixels of closer, differently moving neighbours, which
-    partly show what was uncovered (our reading: (x, y) of eq 3 is the pixel that gets the label, (x', y') has it).
+    Then dilated by a pixel onto neighbours that are farther and move otherwise (eq 3 and 4).
 
     Args:
       ranges: of this frame, leaves ``[..., H, W, C]``.
@@ -136,9 +135,10 @@ def visibility_ghosting(ranges: SampleRanges, previous: SampleRanges, at: Thresh
     around = zip(
         _neighbours(marks, False), _neighbours(closeness, 0.0), _neighbours(velocity, 0.0), strict=True
     )  # outside nothing is marked
+    spread = marks
     for marked, other_closeness, other_velocity in around:
-        marks |= marked & _unlike(closeness, velocity, other_closeness, other_velocity, at)
-    return marks | (inside_mask(ranges.motion) == 0)
+        spread |= marked & _unlike(other_closeness, other_velocity, closeness, velocity, at)
+    return spread | (inside_mask(ranges.motion) == 0)
 
 
 def color_overlap(low: Image, high: Image, other_low: Image, other_high: Image) -> Plane:

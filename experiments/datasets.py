@@ -8,11 +8,20 @@ from essjax.generate import generate, plan
 from experiments.config import Config
 
 
-def prepare(config: Config, data: str | None, out: Path, progress: Callable[[int, int], None]) -> Dataset:
+def prepare(
+    config: Config, data: str | None, out: Path, progress: Callable[[int, int], None], *, ranges: bool = False
+) -> Dataset:
     """Open ``data``, or render the built-in scenes into ``out / "scenes"`` (resumes; complete frames are kept).
 
+    Args:
+      config: the run's settings.
+      data: a dataset's folder, or None to render.
+      out: the run's folder.
+      progress: called with frames done and in all.
+      ranges: the run needs sample ranges.
+
     Raises:
-      ValueError: the dataset lacks a split that a run needs, or was rendered with other settings.
+      ValueError: the dataset lacks a split or the ranges that a run needs, or was rendered with other settings.
     """
     if data is not None:
         dataset = read_dataset(data)
@@ -24,6 +33,7 @@ def prepare(config: Config, data: str | None, out: Path, progress: Callable[[int
             *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
         ]
         settings = {"scale": config.scale, "native": True, "mip_bias": config.mip_bias, "jitter": config.jitter}
+        settings["ranges"] = ranges
         dataset = generate(out / "scenes", clips, width, height, progress=progress, **settings)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):
@@ -31,6 +41,11 @@ def prepare(config: Config, data: str | None, out: Path, progress: Callable[[int
                 f"{dataset.path}: a run needs the splits train, validation and test; this dataset has "
                 f"{', '.join(dataset.splits) or 'none'}. Import it again with --train, --validation and --test."
             )
+    if ranges and not dataset.info.ranges:
+        raise ValueError(
+            f"{dataset.path}: a classifier is trained on labels made of the ranges over all samples of each reference "
+            "pixel, which this dataset does not have. Render the scenes with --ranges; imported frames have none."
+        )
     return dataset
 
 

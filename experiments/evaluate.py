@@ -47,9 +47,9 @@ class Clip:
     exact_holes: bool
 
 
-def load_clip(dataset: Dataset, segment: Segment, warmup: int) -> Clip:
+def load_clip(dataset: Dataset, segment: Segment, warmup: int, *, ranges: bool = False) -> Clip:
     """Read a test segment; the first ``warmup`` frames and as many after each cut are not scored."""
-    sequence = read_segment(dataset, segment)
+    sequence = read_segment(dataset, segment, ranges=ranges)
     since_cut, scored = 0, []
     for n, (cut, counts) in enumerate(zip(np.asarray(sequence.frames.cut), dataset.scored(segment), strict=True)):
         since_cut = 0 if cut or n == 0 else since_cut + 1

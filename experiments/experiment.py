@@ -3,6 +3,7 @@
 Data, training, tuning of the baselines, evaluation, report: each part resumes where an interrupted run left off.
 """
 
+import dataclasses
 import json
 import os
 import platform
@@ -20,12 +21,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from essjax.data import Dataset
 from essjax.deploy import method_cost
 from experiments import datasets
+from experiments.classes import QUESTIONS, class_remark, evaluate_classes
 from experiments.comparison import Trained, make_runners, notes, table_references
 from experiments.config import Config
-from experiments.evaluate import Runner, evaluate, load_clip
+from experiments.evaluate import Clip, Runner, evaluate, load_clip
 from experiments.report import print_table, write_report
+from experiments.report.classes import write_class_sheet
 from experiments.training import restore_stages, train_stages
 from experiments.variants import stages_of, trained_as
+from experiments.variants.classifier import thresholds
 
 
 def claim(out: Path, wanted: Mapping[str, Any], *, resume: bool, eval_only: bool) -> None:
@@ -91,7 +95,12 @@ def run_experiment(
         def on_frame(n: int, total: int) -> None:
             progress.update(bar, completed=n, total=total, text=f"{n}/{total}")
 
-        dataset = datasets.prepare(config, data, out, on_frame)
+        classifiers = [name for name in names if any(stage.ranges for stage in stages_of(name, configs[name]))]
+        dataset = datasets.prepare(config, data, out, on_frame, ranges=bool(classifiers))
+        # Labels depend on the size of the image: a user's data has its own.
+        size = (dataset.info.width, dataset.info.height)
+        configs = {name: dataclasses.replace(each, size=size) for name, each in configs.items()}
+        config = configs[names[0]]
         progress.update(bar, completed=1, total=1, text=f"{len(dataset.sequences)} sequences")
         console.print(datasets.describe(dataset), soft_wrap=True)
         lap("data")
@@ -101,7 +110,10 @@ def run_experiment(
 
         bar = progress.add_task("evaluate", total=None, text="reading")
         segments = {split: dataset.segments(split) for split in ("validation", "test")}
-        clips = {split: [load_clip(dataset, s, config.warmup) for s in segments[split]] for split in segments}
+        clips = {
+            split: [load_clip(dataset, s, config.warmup, ranges=bool(classifiers)) for s in segments[split]]
+            for split in segments
+        }
         runners, settings = make_runners(
             names, config, trained, clips["validation"], out, lambda text: progress.update(bar, text=text)
         )
@@ -113,6 +125,7 @@ def run_experiment(
             pictures=config.pictures,
             on_step=lambda text: progress.update(bar, advance=1, text=text),
         )
+        classes = _evaluate_classes({name: runners[name] for name in classifiers}, configs, clips["test"], out)
         progress.update(bar, text="done")
         lap("evaluation")
     metrics = {
@@ -126,8 +139,11 @@ def run_experiment(
         "costs": costs(runners, dataset),
         "rows": result["rows"],
     }
+    if classes:
+        metrics["classes"] = classes
     references = table_references(runners, clips["test"][0].sequence.scale)
     remarks = notes(dataset, clips["test"], settings, config)
+    remarks += [class_remark(name, scores) for name, scores in classes.items()]
     page = write_report(
         out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references
     )
@@ -194,6 +210,22 @@ def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str
         enlarged = dataset.info.scale if runner.method.info.native else 1
         cost = method_cost(runner.method, dataset.info.width * enlarged, dataset.info.height * enlarged)
         found[name] = cost._asdict()
+    return found
+
+
+def _evaluate_classes(
+    runners: Mapping[str, Runner], configs: Mapping[str, Config], clips: list[Clip], out: Path
+) -> dict[str, Any]:
+    """Scores of each classifier against the automatic labels, and its maps as pictures beside the report."""
+    found = {}
+    for name, runner in runners.items():
+        limits = thresholds(configs[name])
+        scores, maps = evaluate_classes(runner.method, runner.variables, clips, limits, configs[name].compiler_options)
+        if scores:
+            found[name] = scores
+        for each in maps:
+            title = f"{each.sequence}, frame {each.frame}"
+            write_class_sheet(out / "report", title, each.reference, each.predicted, each.automatic, QUESTIONS)
     return found
 
 

@@ -131,7 +131,7 @@ def line(name: str, entry: Entry) -> str:
 
 def page() -> str:
     """The whole page."""
-    return HEAD + "\n".join(line(name, entry) for name, entry in ENTRIES.items() if name in VARIANTS) + "\n"
+    return HEAD + "\n".join(line(name, entry) for name, entry in ENTRIES.items()) + "\n"
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
         )
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
     length = min(config.clip, longest)
-    source = disk_source(dataset, "train")
+    source = disk_source(dataset, "train", ranges=stage.ranges)
     return iter(clips(source, length=length, batch=stage.batch, crop=(height, width), seed=config.seed))
 
 

@@ -5,6 +5,7 @@ otherwise). Gradients are finite everywhere. Reduce with ``jnp.mean``, ``masked_
 """
 
 from essjax.losses.census import census, feature_census
+from essjax.losses.classes import class_weights, cross_entropy
 from essjax.losses.holes import hardest, masked_mean, occlusion
 from essjax.losses.perceptual import perceptual
 from essjax.losses.pixel import charbonnier, l1
@@ -13,6 +14,7 @@ from essjax.losses.temporal import feature_l1, spatio_temporal, sum_of_means, te
 from essjax.losses.vgg import vgg16_features
 
 __all__ = [
-    "census", "charbonnier", "feature_census", "feature_l1", "hardest", "l1", "masked_mean", "occlusion",
+    "census", "charbonnier", "class_weights", "cross_entropy",
+    "feature_census", "feature_l1", "hardest", "l1", "masked_mean", "occlusion",
     "perceptual", "spatio_temporal", "ssim_map", "sum_of_means", "temporal_l1", "vgg16_features",
 ]  # fmt: skip

@@ -1,5 +1,6 @@
 """Flax modules behind ``Network(init, apply)``; the only package that imports flax."""
 
+from essjax.networks.classifier import classifier_network, composition_network
 from essjax.networks.dlctus import dlctus_network
 from essjax.networks.extranet import extranet
 from essjax.networks.extrassnet import extrassnet
@@ -8,4 +9,7 @@ from essjax.networks.frnet import frnet
 from essjax.networks.ifrnet import ifrnet
 from essjax.networks.nsrr import nsrr
 
-__all__ = ["dlctus_network", "extranet", "extrassnet", "fasset", "frnet", "ifrnet", "nsrr"]
+__all__ = [
+    "classifier_network", "composition_network", "dlctus_network", "extranet", "extrassnet", "fasset", "frnet",
+    "ifrnet", "nsrr",
+]  # fmt: skip

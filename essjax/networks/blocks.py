@@ -28,6 +28,19 @@ def mean_pool(image: Image, factor: int = 2) -> Image:
     return blocks.mean(axis=(-4, -2))
 
 
+def max_pool(image: Image) -> Image:
+    """Largest value of each 2 x 2 block, per channel; the sizes must be even.
+
+    By comparisons: linen's is slow to differentiate on CPUs, and the gradient of ``jnp.max`` looks for the value that
+    equals the maximum: where a compiler computes the two differently it finds none and divides by zero.
+    """
+    *lead, height, width, channels = image.shape
+    blocks = image.reshape(*lead, height // 2, 2, width // 2, 2, channels)
+    upper, lower = blocks[..., 0, :, :, :], blocks[..., 1, :, :, :]
+    rows = jnp.where(upper > lower, upper, lower)
+    return jnp.where(rows[..., 0, :] > rows[..., 1, :], rows[..., 0, :], rows[..., 1, :])
+
+
 def nearest_upsample(image: Image, factor: int = 2) -> Image:
     """Repeat each pixel ``factor`` times in both directions."""
     return jnp.repeat(jnp.repeat(image, factor, axis=-3), factor, axis=-2)
@@ -76,9 +89,9 @@ def conv(features: int, size: int = 3, stride: int = 1, **options) -> nn.Conv:
     return nn.Conv(features, (size, size), (stride, stride), conv_general_dilated=scan_friendly_convolution, **options)
 
 
-def batch_norm(train: bool) -> nn.BatchNorm:
+def batch_norm(train: bool, **options) -> nn.BatchNorm:
     """BatchNorm with PyTorch's defaults: eps 1e-5, running statistics that move by 0.1 towards each batch's."""
-    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)
+    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, **options)
 
 
 class ConvNorm(nn.Module):

@@ -2,7 +2,8 @@
 
 XLA:CPU lays out the gradients of a convolution in a loop such that they miss its fast routine and run about 20 times
 slower (docs/adr/0006-scan-friendly-convolution.md). Written out as plain NHWC convolutions they do not. A strided one
-becomes a stride-1 convolution of blocks first. On other backends the ordinary convolution is used.
+becomes a stride-1 convolution of blocks first, a depthwise one a sum of shifted products. On other backends the
+ordinary convolution is used.
 """
 
 from functools import partial
@@ -59,20 +60,57 @@ def _by_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -
     return _convolve(x, kernel, tuple((low, n - 1 - low) for low, n in zip(lows, blocks, strict=True)))
 
 
+def _shifted(x: jax.Array, kernel: jax.Array, padding: Padding) -> list[list[jax.Array]]:
+    """What each place of the kernel sees, ``[kh][kw]`` arrays of the output's size."""
+    padded = jnp.pad(x, [(0, 0), *padding, (0, 0)])
+    height, width = (
+        n + low + high + 1 - size for n, (low, high), size in zip(x.shape[1:3], padding, kernel.shape, strict=False)
+    )
+    rows = [padded[:, i : i + height] for i in range(kernel.shape[0])]
+    return [[row[:, :, j : j + width] for j in range(kernel.shape[1])] for row in rows]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _depthwise(x: jax.Array, kernel: jax.Array, padding: Padding) -> jax.Array:
+    """One kernel ``[kh, kw, 1, C]`` per channel, as a sum of shifted products: they fuse, no convolution does."""
+    seen = _shifted(x, kernel, padding)
+    products = [part * kernel[i, j, 0] for i, row in enumerate(seen) for j, part in enumerate(row)]
+    return sum(products[1:], start=products[0])
+
+
+def _depthwise_forward(x, kernel, padding):
+    return _depthwise(x, kernel, padding), (x, kernel)
+
+
+def _depthwise_backward(padding, residuals, gradient):
+    x, kernel = residuals
+    reverse = tuple((size - 1 - low, size - 1 - high) for size, (low, high) in zip(kernel.shape, padding, strict=False))
+    sums = [[jnp.sum(part * gradient, axis=(0, 1, 2)) for part in row] for row in _shifted(x, kernel, padding)]
+    to_kernel = jnp.stack([jnp.stack(row) for row in sums])[:, :, None]
+    return _depthwise(gradient, kernel[::-1, ::-1], reverse), to_kernel
+
+
+_depthwise.defvjp(_depthwise_forward, _depthwise_backward)
+
+
 def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation=None, rhs_dilation=None, **options):
     """``lax.conv_general_dilated`` for linen's ``conv_general_dilated=``: NHWC, on the CPU with gradients of our own.
 
     They need a kernel no larger than its padding allows: an output as large as the input (stride 1), or one pixel per
-    ``stride`` x ``stride`` block (sizes must be multiples of the stride). Anything else, and every backend but the CPU,
-    falls through to the ordinary one.
+    ``stride`` x ``stride`` block (sizes must be multiples of the stride). With a group per channel (depthwise, one
+    kernel each) the stride must be 1. Anything else, and every backend but the CPU, falls through to the ordinary one.
     """
     sizes, strides = lhs.shape[1:3], tuple(window_strides)
-    simple = options.get("feature_group_count", 1) == 1 and jax.default_backend() == "cpu"
+    groups = options.get("feature_group_count", 1)
+    depthwise = 1 < groups == lhs.shape[3] == rhs.shape[3] and strides == (1, 1)
+    simple = (groups == 1 or depthwise) and jax.default_backend() == "cpu"
     simple &= all(d in (None, (1, 1), [1, 1]) or tuple(d) == (1, 1) for d in (lhs_dilation, rhs_dilation))
     if simple and strides[0] == strides[1] and all(size % strides[0] == 0 for size in sizes):
         pairs = lax.padtype_to_pads(sizes, rhs.shape[:2], strides, padding) if isinstance(padding, str) else padding
         pairs = tuple((int(low), int(high)) for low, high in pairs)
         if all(n - strides[0] <= low + high < n and low < n for n, (low, high) in zip(rhs.shape, pairs, strict=False)):
+            if depthwise:
+                return _depthwise(lhs, rhs, pairs)
             return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _by_blocks(lhs, rhs, strides[0], pairs)
     return lax.conv_general_dilated(
         lhs, rhs, window_strides, padding, lhs_dilation=lhs_dilation, rhs_dilation=rhs_dilation, **options

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from experiments.config import Config, make_config
-from experiments.variants import baselines, dlctus, extranet, extrass, fasset, interpolation, nsrr
+from experiments.variants import baselines, classifier, dlctus, extranet, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
 VARIANTS: dict[str, Variant] = {
@@ -13,6 +13,7 @@ VARIANTS: dict[str, Variant] = {
     **dlctus.VARIANTS,
     **nsrr.VARIANTS,
     **interpolation.VARIANTS,
+    **classifier.VARIANTS,
     **baselines.VARIANTS,
 }
 """Every variant by name."""

@@ -21,6 +21,7 @@ class Stage:
       learning_rate: its peak.
       budget: when it ends.
       decay: of the learning rate, ``progress -> factor``.
+      ranges: its objective needs the clips' sample ranges.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Stage:
     learning_rate: float
     budget: Budget
     decay: Callable[[float], float] = cosine
+    ranges: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,7 +37,7 @@ def dataset(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr(datasets, "plan", functools.partial(plan, families=["carousel"]))
     config = config_of("extrass", "smoke", SIZES)
-    yield datasets.prepare(config, None, tmp_path_factory.mktemp("every"), lambda n, total: None)
+    yield datasets.prepare(config, None, tmp_path_factory.mktemp("every"), lambda n, total: None, ranges=True)
     patch.undo()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from essjax.networks.blocks import ConvNorm, GatedConv, bilinear_upsample, bilinear_upsample_corners
+from essjax.networks.blocks import ConvNorm, GatedConv, bilinear_upsample, bilinear_upsample_corners, max_pool
 from essjax.networks.linen import from_linen
 from tests.helpers import random_image
 
@@ -76,3 +76,18 @@ def test_upsampling_corners_on_corners_reads_where_pytorch_does():
         for c in range(3):
             expected = ndimage.map_coordinates(image[b, ..., c], grid, order=1)
             np.testing.assert_allclose(got[b, ..., c], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_max_pool_and_its_gradient():
+    image = random_image(2, 2, 4, 6, 3)
+    weights = random_image(3, 2, 2, 3, 3)
+
+    def total(image):
+        return (max_pool(jax.nn.relu(image - 1.0)) * weights).sum()
+
+    gradient = jax.jit(jax.grad(total), compiler_options={"xla_backend_optimization_level": 0})(image)
+    blocks = np.asarray(image).reshape(2, 2, 2, 3, 2, 3).transpose(0, 1, 3, 5, 2, 4).reshape(2, 2, 3, 3, 4)
+    np.testing.assert_allclose(max_pool(image), blocks.max(axis=-1))
+    largest = (blocks == blocks.max(axis=-1, keepdims=True)) & (blocks > 1.0)
+    expected = (largest * np.asarray(weights)[..., None]).reshape(2, 2, 3, 3, 2, 2).transpose(0, 1, 4, 2, 5, 3)
+    np.testing.assert_allclose(gradient, expected.reshape(image.shape), rtol=1e-6)

@@ -55,6 +55,27 @@ def test_value_and_gradients_equal_the_plain_convolution(monkeypatch, size, stri
         friendly(x, kernel, (stride, stride), padding)
 
 
+@pytest.mark.parametrize(("size", "padding"), [((3, 3), "SAME"), ((2, 3), [(1, 0), (0, 2)])], ids=["3x3", "lopsided"])
+def test_depthwise_equals_the_grouped_convolution(monkeypatch, size, padding):
+    x, kernel = random_image(0, 2, 5, 8, 3, low=-1.0), random_image(1, *size, 1, 3, low=-1.0)
+    target = random_image(2, 2, 5, 8, 3)
+    options = {"dimension_numbers": NHWC, "feature_group_count": 3}
+
+    @jax.jit
+    def evaluate(x, kernel):
+        results = []
+        for function in (scan_friendly_convolution, lax.conv_general_dilated):
+            value, pull = jax.vjp(lambda x, k, f=function: f(x, k, (1, 1), padding, **options), x, kernel)
+            results.append((value, *pull(target)))
+        return results
+
+    for ours, theirs in zip(*evaluate(x, kernel), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+    monkeypatch.setattr(convolution, "_depthwise", _refuse)
+    with pytest.raises(AssertionError, match="must not take"):
+        scan_friendly_convolution(x, kernel, (1, 1), padding, **options)
+
+
 def _refuse(x, kernel, padding):
     raise AssertionError("the special case must not take this convolution")
 
@@ -66,12 +87,14 @@ def _refuse(x, kernel, padding):
         ((3, 3, 3, 2), (1, 1), "VALID", {}),
         ((3, 3, 3, 2), (2, 1), "SAME", {}),
         ((3, 3, 3, 2), (1, 1), "SAME", {"rhs_dilation": (2, 2)}),
-        ((3, 3, 1, 3), (1, 1), "SAME", {"feature_group_count": 3}),
+        ((3, 3, 1, 6), (1, 1), "SAME", {"feature_group_count": 3}),
+        ((3, 3, 1, 3), (2, 2), "SAME", {"feature_group_count": 3}),
     ],
-    ids=["odd-size", "valid", "two-strides", "dilated", "grouped"],
+    ids=["odd-size", "valid", "two-strides", "dilated", "grouped", "strided-depthwise"],
 )
 def test_everything_else_falls_through(monkeypatch, shape, strides, padding, options):
     monkeypatch.setattr(convolution, "_convolve", _refuse)
+    monkeypatch.setattr(convolution, "_depthwise", _refuse)
     x, kernel = random_image(0, 1, 5, 8, 3), random_image(1, *shape)
     arguments = (x, kernel, strides, padding)
     result = scan_friendly_convolution(*arguments, dimension_numbers=NHWC, **options)
