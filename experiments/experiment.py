@@ -182,7 +182,7 @@ def _train_all(
         stages = stages_of(name, config)
         if base in trained or not stages:
             continue
-        if not config.vgg and base == "extrass":
+        if not config.vgg and any(stage.vgg for stage in stages):
             progress.console.print(
                 "VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on.",
                 soft_wrap=True,

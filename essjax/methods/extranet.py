@@ -5,7 +5,6 @@ motion; disoccluded pixels are marked; the network repairs them and moves shadow
 modulated with the new frame's base colour.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from essjax import networks
 from essjax.color import demodulate, expm1, log1p, modulate
 from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require, surface_guides
 from essjax.interfaces import Method, MethodInfo, expand_flag
-from essjax.methods.rendered import Memory, advance, albedo, push, reset_memory, start_memory
+from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, push, reset_memory, start_memory
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import from_torch as network_from_torch
 from essjax.tensors import read_tensors
@@ -56,11 +55,6 @@ class Inputs:
     mask: Mask
     features: Image
     history: Image
-
-
-def hole_buffers(gbuffers: GBuffers) -> GBuffers:
-    """Those that marking holes needs of an earlier frame."""
-    return dataclasses.replace(gbuffers, base_color=None, roughness=None, metallic=None, specular=None, n_dot_v=None)
 
 
 def _kept(color: Color, gbuffers: GBuffers) -> Kept:

@@ -23,7 +23,7 @@ from essjax.frames import (
     surface_guides,
 )
 from essjax.interfaces import Method, MethodInfo, reset_at_cut
-from essjax.methods.rendered import GUIDED, Memory, advance, push, reset_memory, start_memory
+from essjax.methods.rendered import GUIDED, Memory, advance, hole_buffers, push, reset_memory, start_memory
 from essjax.typing import Color, Image, Mask, Scalar, pytree
 from essjax.warp import backward_warp, fill_holes, hole_mask, jitter_aligned_upsample, jittered_motion
 
@@ -75,8 +75,7 @@ class Arrival(NamedTuple):
 
 
 def _surfaces(gbuffers: GBuffers) -> GBuffers:
-    kept = dataclasses.replace(gbuffers, base_color=None, roughness=None, metallic=None, specular=None, n_dot_v=None)
-    return jax.tree.map(jnp.copy, kept)  # streaming donates the history, not the frame
+    return jax.tree.map(jnp.copy, hole_buffers(gbuffers))  # streaming donates the history, not the frame
 
 
 def _start(example: Frame, width: int) -> History:

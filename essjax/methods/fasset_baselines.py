@@ -9,9 +9,9 @@ from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods.baselines import jau_image
 from essjax.methods.composed import composed
-from essjax.methods.extranet import REQUIRES, Inputs, Kept, extranet, hole_buffers, network_inputs
+from essjax.methods.extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
 from essjax.methods.nsrr import nsrr
-from essjax.methods.rendered import Memory, advance, albedo, push, reset_memory, start_memory
+from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, push, reset_memory, start_memory
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import extranet as extranet_network
 from essjax.typing import Color, Image

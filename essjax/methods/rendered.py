@@ -50,6 +50,11 @@ class Memory:
     jitter: Jitter
 
 
+def hole_buffers(gbuffers: GBuffers) -> GBuffers:
+    """Those that marking holes needs of an earlier frame."""
+    return dataclasses.replace(gbuffers, base_color=None, roughness=None, metallic=None, specular=None, n_dot_v=None)
+
+
 def start_memory(example: Frame, content: PyTree, frames: int) -> Memory:
     """A memory of nothing, for ``frames`` frames of the shapes of ``example`` and ``content``."""
 

@@ -22,6 +22,7 @@ class Stage:
       budget: when it ends.
       decay: of the learning rate, ``progress -> factor``.
       ranges: its objective needs the clips' sample ranges.
+      vgg: its loss has a perceptual term, which needs the weights that ``Config.vgg`` names.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Stage:
     budget: Budget
     decay: Callable[[float], float] = cosine
     ranges: bool = False
+    vgg: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -38,7 +38,7 @@ def _extrass_stage(config: Config) -> Stage:
         temporal_weight=config.temporal_weight,
         vgg_features=vgg16_features(config.vgg) if config.vgg else None,
     )
-    return Stage("extrassnet", method, objective, config.batch, config.learning_rate, main_budget(config))
+    return Stage("extrassnet", method, objective, config.batch, config.learning_rate, main_budget(config), vgg=True)
 
 
 VARIANTS = {

@@ -18,7 +18,7 @@ def nsrr_stage(config: Config, *, half: bool = False, within: Method | None = No
     method = _nsrr(config, half=half)
     features = vgg16_features(config.vgg, layers=VGG_LAYERS) if config.vgg else None
     objective = nsrr_objective(method, vgg_weight=config.vgg_weight, vgg_features=features, half=half)
-    return Stage("nsrr", within or method, objective, config.batch, config.learning_rate, main_budget(config))
+    return Stage("nsrr", within or method, objective, config.batch, config.learning_rate, main_budget(config), vgg=True)
 
 
 VARIANTS = {

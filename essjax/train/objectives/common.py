@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.frames import Frame, Prediction, Sequence, select_time, without_color
-from essjax.interfaces import Method
+from essjax.interfaces import Method, Step
 from essjax.rollout import ESS, SS, Schedule, alternate, unroll
 from essjax.typing import Array, Callable, PyTree
 
@@ -72,25 +72,22 @@ def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Sch
     if length < 2:
         raise ValueError(f"clip: expected at least 2 frames, the last to predict and one before it, got {length}.")
     schedule = alternate(length % 2) if schedule is None else schedule
-    kinds, (_, period, lead) = schedule.kinds(length), schedule
+    before: Frame = select_time(frames, slice(0, length - 1))
+    history = unroll(_unseen(method), variables, before, schedule).history
+    last: Frame = select_time(frames, length - 1)
+    if schedule.kinds(length)[-1] == SS:
+        return method.render_step(variables, history, last, train=True)[1]
+    return method.extrapolate_step(variables, history, without_color(last), train=True)[1]
 
-    def step(history: PyTree, frame: Frame, kind: str, train: bool = False) -> tuple[PyTree, Prediction]:
-        if kind == SS:
-            return method.render_step(variables, history, frame, train=train)
-        return method.extrapolate_step(variables, history, without_color(frame), train=train)
 
-    def several(history: PyTree, chunk: Frame) -> tuple[PyTree, None]:
-        for k in range(period):
-            history, _ = step(history, select_time(chunk, k), kinds[lead + k])
-        return history, None
+def _unseen(method: Method) -> Method:
+    """``method`` without images: a rollout of it computes what the history needs, and nothing else."""
 
-    lead = min(lead, length - 1)
-    scanned = (length - 1 - lead) // period
-    body_end, history = lead + scanned * period, method.start(select_time(frames, 0))
-    for n in range(lead):
-        history, _ = step(history, select_time(frames, n), kinds[n])
-    body = jax.tree.map(lambda leaf: leaf[lead:body_end].reshape(scanned, period, *leaf.shape[1:]), frames)
-    history, _ = jax.lax.scan(several, history, body)
-    for n in range(body_end, length - 1):
-        history, _ = step(history, select_time(frames, n), kinds[n])
-    return step(history, select_time(frames, length - 1), kinds[-1], train=True)[1]
+    def silent(step: Step) -> Step:
+        def run(variables, history, frame, *, train=False):
+            return step(variables, history, frame, train=train)[0], Prediction(image=jnp.zeros(()))
+
+        return run
+
+    steps = {"render_step": silent(method.render_step), "extrapolate_step": silent(method.extrapolate_step)}
+    return method._replace(**steps)
