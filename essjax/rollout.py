@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from essjax.frames import Frame, check_shapes, require, select_time, without_color
 from essjax.interfaces import Method
+from essjax.networks import compute_dtype
 from essjax.typing import Array, Callable, PyTree, pytree
 
 SS, ESS = "ss", "ess"
@@ -172,11 +173,19 @@ def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
     return [n for n, k in enumerate(kinds) if k == kind]
 
 
-def stream_step(method: Method, kind: str, *, compiler_options: dict | None = None) -> Callable:
-    """One jitted step for streaming, history donated: ``(variables, history, frame) -> (history, image)``."""
+def stream_step(method: Method, kind: str, *, dtype: str = "float32", compiler_options: dict | None = None) -> Callable:
+    """One jitted step for streaming, history donated: ``(variables, history, frame) -> (history, image)``.
+
+    Args:
+      method: the two steps.
+      kind: ``SS`` or ``ESS``.
+      dtype: the networks' compute type, "float32", "bfloat16" or "float16"; inputs and outputs stay float32.
+      compiler_options: for ``jax.jit``.
+    """
 
     def step(variables, history, frame):
-        history, prediction = _step(method, variables, history, frame, kind, train=False)
+        with compute_dtype(dtype):
+            history, prediction = _step(method, variables, history, frame, kind, train=False)
         return history, prediction.image
 
     return jax.jit(step, donate_argnums=1, compiler_options=compiler_options)

@@ -5,22 +5,18 @@ Data, training, tuning of the baselines, evaluation, report: each part resumes w
 
 import dataclasses
 import json
-import os
-import platform
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jax
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from essjax.data import Dataset
 from essjax.deploy import method_cost
 from experiments import datasets
+from experiments import environment as machine
 from experiments.classes import QUESTIONS, class_remark, evaluate_classes
 from experiments.comparison import Trained, make_runners, notes, table_references
 from experiments.config import Config
@@ -238,17 +234,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def environment(config: Config, reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Commit, device, versions, seed and steps (stage -> steps; of several variants "variant/stage" -> steps)."""
-    root = Path(__file__).resolve().parent.parent
-    try:
-        git = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-        commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    packages = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
     return {
-        "commit": commit,
-        "device": f"{jax.devices()[0].device_kind} ({jax.default_backend()}), {os.cpu_count()} CPU cores",
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
+        **machine.environment(),
         "seed": config.seed,
         "steps": {
             stage if len(reports) == 1 else f"{name}/{stage}": found["steps"]

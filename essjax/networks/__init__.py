@@ -8,8 +8,9 @@ from essjax.networks.fasset import fasset
 from essjax.networks.frnet import frnet
 from essjax.networks.ifrnet import ifrnet
 from essjax.networks.nsrr import nsrr
+from essjax.networks.precision import compute_dtype
 
 __all__ = [
-    "classifier_network", "composition_network", "dlctus_network", "extranet", "extrassnet", "fasset", "frnet",
-    "ifrnet", "nsrr",
+    "classifier_network", "composition_network", "compute_dtype", "dlctus_network", "extranet", "extrassnet", "fasset",
+    "frnet", "ifrnet", "nsrr",
 ]  # fmt: skip

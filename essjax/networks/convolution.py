@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from essjax.networks.precision import in_compute_dtype
+
 _NHWC = ("NHWC", "HWIO", "NHWC")
 Padding = tuple[tuple[int, int], ...]
 """(before, behind) of rows and of columns."""
@@ -93,6 +95,7 @@ def _depthwise_backward(padding, residuals, gradient):
 _depthwise.defvjp(_depthwise_forward, _depthwise_backward)
 
 
+@in_compute_dtype
 def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation=None, rhs_dilation=None, **options):
     """``lax.conv_general_dilated`` for linen's ``conv_general_dilated=``: NHWC, on the CPU with gradients of our own.
 

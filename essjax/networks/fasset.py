@@ -11,6 +11,7 @@ from essjax.interfaces import Network
 from essjax.networks.blocks import Chain, GatedConv, conv, crop, mean_pool, pad_to_multiple
 from essjax.networks.extrassnet import Decoder
 from essjax.networks.linen import from_linen, kernel_bound
+from essjax.networks.precision import dot_general
 from essjax.typing import Array, Image, Jitter, Mask
 from essjax.warp import jitter_aligned_upsample
 
@@ -97,6 +98,11 @@ class Reweighting(nn.Module):
         return weights[..., :1], weights[..., 1:]
 
 
+def dense(features: int, **options) -> nn.Dense:
+    """A pixelwise layer in the networks' compute type."""
+    return nn.Dense(features, dot_general=dot_general, **options)
+
+
 class RenderINR(nn.Module):
     """f_theta of eq 1: three hidden layers, ReLU, linear output, evaluated at every output pixel.
 
@@ -112,11 +118,11 @@ class RenderINR(nn.Module):
     @nn.compact
     def __call__(self, latents: Image, pixel_size: Array) -> Image:
         """Colour ``[B, h, w, 3]`` from latents z*, z_g* ``[B, h, w, C]`` and the pixel size a, ``[1]``, LR pixels."""
-        x = nn.Dense(self.hidden, kernel_init=kernel_bound)(latents)
-        x = x + nn.Dense(self.hidden, use_bias=False, kernel_init=nn.initializers.zeros, name="pixel_size")(pixel_size)
+        x = dense(self.hidden, kernel_init=kernel_bound)(latents)
+        x = x + dense(self.hidden, use_bias=False, kernel_init=nn.initializers.zeros, name="pixel_size")(pixel_size)
         for _ in range(2):
-            x = nn.Dense(self.hidden, kernel_init=kernel_bound)(nn.relu(x))
-        return nn.Dense(3, kernel_init=nn.initializers.zeros)(nn.relu(x))
+            x = dense(self.hidden, kernel_init=kernel_bound)(nn.relu(x))
+        return dense(3, kernel_init=nn.initializers.zeros)(nn.relu(x))
 
 
 class FASSET(nn.Module):

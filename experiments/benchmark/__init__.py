@@ -1,0 +1,1 @@
+"""``python -m experiments.benchmark``: how fast everything is, beside what people would otherwise run."""
