@@ -39,7 +39,7 @@ def compute_dtype(name: str) -> Iterator[None]:
 
 
 def in_compute_dtype(product: Callable) -> Callable:
-    """``product(lhs, rhs, ...)`` with both operands rounded to the compute type; the result has ``lhs``'s type again."""
+    """``product`` of two operands that are rounded to the compute type; its result has the first one's type again."""
 
     @wraps(product)
     def rounded(lhs, rhs, *arguments, **options):
