@@ -1,5 +1,6 @@
 """A low-resolution frame resampled to the output grid, with what temporal accumulation must know of its samples."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -56,20 +57,42 @@ def _tent_axis(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Arra
     return index, weight / jnp.where(total > 0, total, 1.0), jnp.zeros_like(total)
 
 
+def _take(image: Array, index: Array, axis: int) -> Array:
+    """Rows or columns of an image; every index is inside."""
+    return image.at[(slice(None),) * axis + (index,)].get(mode="promise_in_bounds")
+
+
+def _of_three(image: Array, axis: int, merge: Callable) -> Array:
+    """``merge`` of each pixel and its two neighbours along ``axis``, borders repeated."""
+    padded = jnp.pad(image, [(int(k == axis),) * 2 for k in range(image.ndim)], mode="edge")
+    return merge([jax.lax.slice_in_dim(padded, k, k + image.shape[axis], axis=axis) for k in range(3)])
+
+
+_MERGES: tuple[Callable, ...] = (
+    lambda three: functools.reduce(jnp.minimum, three),
+    lambda three: functools.reduce(jnp.maximum, three),
+    lambda three: sum(three) / 3.0,
+)
+
+
 def _resample_one(color: Array, bounded: Array, jitter: Array, axis: Callable) -> Resampled:
     height, width = color.shape[:2]
     columns, column_weight, column_log = axis(width, jitter[0])
     rows, row_weight, row_log = axis(height, jitter[1])
     columns = jnp.clip(columns, 0, width - 1).astype(jnp.int32)
     rows = jnp.clip(rows, 0, height - 1).astype(jnp.int32)
-    # The kernel of a grid is a product: rows first, then columns. So are the minimum, the maximum and the mean.
-    tall = jnp.sum(color[rows] * row_weight[..., None, None], axis=0)
-    mean = jnp.sum(jnp.moveaxis(tall[:, columns], 1, 0) * column_weight[:, None, :, None], axis=0)
-    near = bounded[rows]
-    low, high, average = near.min(axis=0), near.max(axis=0), near.mean(axis=0)
-    low, high, average = low[:, columns].min(axis=1), high[:, columns].max(axis=1), average[:, columns].mean(axis=1)
+    # Barriers: fused into what reads it three times, each stage would be computed three times for every pixel.
+    columns, column_weight, rows, row_weight = jax.lax.optimization_barrier((columns, column_weight, rows, row_weight))
+    # The kernel of a grid is a product: rows first, then columns.
+    tall = sum(_take(color, rows[k], 0) * row_weight[k][:, None, None] for k in range(3))
+    tall = jax.lax.optimization_barrier(tall)
+    mean = sum(_take(tall, columns[k], 1) * column_weight[k][:, None] for k in range(3))
+    # The nine samples around an output pixel are those around its nearest one: found at low resolution.
+    boxes = jnp.concatenate([_of_three(_of_three(bounded, 0, merge), 1, merge) for merge in _MERGES], axis=-1)
+    boxes = _take(_take(jax.lax.optimization_barrier(boxes), rows[0], 0), columns[0], 1)
+    low, high, average = jnp.split(boxes, 3, axis=-1)
     weight = jnp.exp(row_log[:, None, None] + column_log[None, :, None])
-    return Resampled(mean, weight, low, high, average)
+    return Resampled(jnp.asarray(mean), weight, low, high, average)
 
 
 def _resample(color: Image, bounded: Image, jitter: Jitter, axis: Callable) -> Resampled:

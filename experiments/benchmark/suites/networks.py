@@ -1,0 +1,98 @@
+"""Forward passes of the networks, one frame, weights as arguments."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from essjax import networks
+from essjax.deploy import count_parameters
+from essjax.interfaces import Network
+from essjax.networks import compute_dtype
+from essjax.networks.extranet import input_shapes
+from essjax.networks.nsrr import FEATURES, PREVIOUS
+from experiments.benchmark import inputs
+from experiments.benchmark.measure import Case, measure
+from experiments.benchmark.suites import Options, Row
+
+
+class Forward(NamedTuple):
+    """A forward pass.
+
+    Attributes:
+      name: with its sizes.
+      network: init and apply.
+      init: shapes that ``init`` takes.
+      inputs: shapes that ``apply`` takes.
+      method: of ``apply``; None: the default.
+      pixels: of the output.
+    """
+
+    name: str
+    network: Network
+    init: tuple
+    inputs: tuple
+    method: str | None
+    pixels: int
+
+
+def _shape(*size: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(size, jnp.float32)
+
+
+def forwards(width: int, height: int) -> list[Forward]:
+    """Every network at the sizes at which a method runs it when frames are ``width`` x ``height`` and output twice."""
+    low, high = (1, height, width), (1, 2 * height, 2 * width)
+    half = (1, -(-height // 2), -(-width // 2))
+    # ExtraNet is published at 720p: here 4/3 of the size.
+    native = {"height": height * 4 // 3, "width": width * 4 // 3}
+    names = {"low": f"{width}x{height}", "high": f"{2 * width}x{2 * height}"}
+    extrass = _shape(*low, 31), _shape(*low, 37)
+    fasset = (*(_shape(*low, n) for n in (3, 1, 7, 24)), _shape(1, 2))
+    features = _shape(*low, 4), _shape(*high, FEATURES), _shape(PREVIOUS, *high, FEATURES)
+    frnet = _shape(2, *half, 3), _shape(*half, 1)
+    extranet = input_shapes(1, **native)
+    extrassnet = networks.extrassnet()
+
+    def forward(name, network, shapes, pixels, *, method=None, given=None):
+        return Forward(name, network, shapes, shapes if given is None else given, method, pixels)
+
+    sizes = width * height, 4 * width * height
+    to_high = f"{names['low']} to {names['high']}"
+    return [
+        forward(f"ExtraSSNet SS, {to_high}", extrassnet, extrass, sizes[1], method="render", given=extrass[:1]),
+        forward(f"ExtraSSNet ESS, {to_high}", extrassnet, extrass, sizes[1], method="extrapolate", given=extrass[1:]),
+        forward(f"FRNet, {half[2]}x{half[1]}", networks.frnet(), frnet, sizes[0]),
+        forward(
+            f"ExtraNet, {native['width']}x{native['height']}", networks.extranet(), extranet, extranet[1].size
+        ),
+        forward(f"DLCTUS, {names['high']}", networks.dlctus_network(), (_shape(*high, 8),), sizes[1]),
+        forward(f"FASSET, {to_high}", networks.fasset(2), fasset, sizes[1], method="render"),
+        forward(f"IFRNet, {names['low']}", networks.ifrnet(), (_shape(2, *low, 3), _shape(2, 1, 2)), sizes[0]),
+        forward(
+            f"NSRR, {names['high']}", networks.nsrr(), features, sizes[1], method="reconstruct", given=features[1:]
+        ),
+    ]  # fmt: skip
+
+
+def case(forward: Forward, dtype: str) -> Case:
+    """The forward pass on noise, products in ``dtype``."""
+    variables = jax.jit(lambda key: forward.network.init(key, *forward.init))(jax.random.key(0))
+
+    def apply(variables, *arguments):
+        with compute_dtype(dtype):
+            return forward.network.apply(variables, *arguments, method=forward.method)[0]
+
+    arguments = (variables, *inputs.random_like(forward.inputs))
+    return Case(forward.name, apply, arguments, work={"pixels": forward.pixels})
+
+
+def rows(options: Options) -> Iterator[Row]:
+    """Each network in each compute type, then its peers."""
+    for forward in forwards(options.width, options.height):
+        for dtype in options.dtypes:
+            made = case(forward, dtype)
+            yield {
+                **measure(made, options.repetitions), "dtype": dtype, "parameters": count_parameters(made.arguments[0])
+            }  # fmt: skip

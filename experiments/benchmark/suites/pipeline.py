@@ -1,0 +1,129 @@
+"""Streaming: whole methods frame by frame, as a viewer of a game gets them. History stays on the device."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from essjax import methods
+from essjax.frames import without_color
+from essjax.interfaces import Method
+from essjax.rollout import ESS, SS, alternate, every, stream_step, unroll
+from essjax.typing import PyTree
+from experiments.benchmark import inputs
+from experiments.benchmark.measure import Compilations, summary
+from experiments.benchmark.suites import Options, Row
+
+DISTINCT = 8
+"""Different frames that are streamed in turn."""
+COMPARED = 6
+"""Frames on which streaming is compared with the unrolled method."""
+BINS = 20
+
+
+def streamed_methods() -> dict[str, Method]:
+    """The parts of ExtraSS as its paper's Table 4 times them, other methods' whole steps, and TAAU."""
+    return {
+        "extrass-w": methods.extrass_w(),
+        "extrass-e": methods.extrass_e(),
+        "extrass": methods.extrass(),
+        "extranet": methods.extranet(),
+        "fasset": methods.fasset(),
+        "dlctus": methods.dlctus(),
+        "taau": methods.taau(),
+    }
+
+
+def stream(
+    method: Method, steps: dict[str, Callable], variables: PyTree, frames: list, count: int
+) -> dict[str, np.ndarray]:
+    """Seconds of each frame by kind, frame into the device and image out of it included; everything else is refused.
+
+    Args:
+      method: says what the history is and whether every frame is rendered.
+      steps: kind -> from ``stream_step``, compiled.
+      variables: on the device.
+      frames: on the host, rendered in turn.
+      count: frames to stream.
+    """
+    kinds = (every() if method.info.renders_all else alternate()).kinds(count)
+    seconds: dict[str, list[float]] = {kind: [] for kind in dict.fromkeys(kinds)}
+    history = method.start(jax.device_put(frames[0]))
+    for n, kind in enumerate(kinds):
+        frame = frames[n % len(frames)]
+        start = time.perf_counter()
+        frame = jax.device_put(frame if kind == SS else without_color(frame))
+        with jax.transfer_guard("disallow"):
+            history, image = steps[kind](variables, history, frame)
+            image.block_until_ready()
+        jax.device_get(image)
+        seconds[kind].append(time.perf_counter() - start)
+    return {kind: np.array(values) for kind, values in seconds.items()}
+
+
+def largest_difference(method: Method, steps: dict[str, Callable], variables: PyTree, frames: list) -> float:
+    """Between streamed and unrolled images of the first frames, relative to the images' mean."""
+    schedule = every() if method.info.renders_all else alternate()
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames[:COMPARED])
+    unrolled = jax.jit(lambda variables, frames: unroll(method, variables, frames, schedule).image)(variables, stacked)
+    history, worst = method.start(jax.device_put(frames[0])), 0.0
+    for n, kind in enumerate(schedule.kinds(len(frames[:COMPARED]))):
+        frame = jax.device_put(frames[n] if kind == SS else without_color(frames[n]))
+        history, image = steps[kind](variables, history, frame)
+        worst = max(worst, float(np.abs(image - unrolled[n]).max()))
+    return worst / float(np.abs(unrolled).mean())
+
+
+def rows(options: Options) -> Iterator[Row]:
+    """A row per method, kind of frame and compute type: latencies of ``options.frames`` frames."""
+    frames = inputs.frames(DISTINCT, options.width, options.height)
+    for name, method in streamed_methods().items():
+        variables = jax.jit(method.init)(jax.random.key(0), frames[0])
+        for dtype in options.dtypes if variables else ("float32",):
+            yield from _method_rows(name, method, variables, frames, dtype, options)
+
+
+def _method_rows(
+    name: str, method: Method, variables: PyTree, frames: list, dtype: str, options: Options
+) -> Iterator[Row]:
+    kinds = (SS,) if method.info.renders_all else (SS, ESS)
+    steps = {kind: stream_step(method, kind, dtype=dtype) for kind in kinds}
+    building = {}
+    history = method.start(jax.device_put(frames[0]))
+    for kind in kinds:
+        given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
+        with Compilations() as building[kind]:
+            history, _ = jax.block_until_ready(steps[kind](variables, history, given))
+    difference = largest_difference(method, steps, variables, frames) if dtype == "float32" else None
+    with Compilations() as streaming:
+        seconds = stream(method, steps, variables, frames, options.frames)
+    if streaming.count:
+        raise RuntimeError(f"{name}: compiled {streaming.count} times while streaming.")
+    for kind in kinds:
+        if kind not in method.info.predicts:
+            continue
+        row: dict[str, Any] = {"name": f"{name} {kind.upper()}, {options.width}x{options.height}"}
+        row |= {"implementation": "essjax", "dtype": dtype, **summary(seconds[kind])}
+        row |= {"compile_seconds": building[kind].seconds, "compilations": building[kind].count}
+        row |= {"latency": latency(seconds[kind]), "work": {"frames": 1.0}}
+        if difference is not None:
+            row["difference_from_unrolled"] = difference
+        yield row
+
+
+def latency(seconds: np.ndarray) -> dict[str, Any]:
+    """Percentiles and histogram, ms."""
+    values = 1e3 * seconds
+    counts, edges = np.histogram(values, bins=BINS)
+    percentiles = {f"p{p}": float(np.percentile(values, p)) for p in (5, 50, 95, 99)}
+    return {**percentiles, "worst": float(values.max()), "counts": counts.tolist(), "edges": edges.tolist()}
+
+
+def facts(rows: list[Row]) -> dict[str, float]:
+    """How much an extrapolated frame costs beside a rendered one of ``extrass``."""
+    medians = {row["name"].split(",")[0]: row["median_ms"] for row in rows if row["dtype"] == "float32"}
+    if not {"extrass SS", "extrass ESS"} <= set(medians):
+        return {}
+    return {"extrass: time of an ESS frame over that of an SS frame": medians["extrass ESS"] / medians["extrass SS"]}

@@ -1,0 +1,138 @@
+"""Train steps of ExtraSS: cost against frames and pixels, remat, the gradients of convolutions in a scan, waiting."""
+
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from essjax.frames import Frame, Sequence
+from essjax.generate import generate, plan
+from essjax.interfaces import Method
+from essjax.rollout import alternate, unroll
+from essjax.train import create_state, make_train_step, optimizer
+from experiments.benchmark import inputs
+from experiments.benchmark.measure import Case, measure, summary
+from experiments.benchmark.suites import Options, Row
+from experiments.config import Config, make_config
+from experiments.training import initial_variables, make_batches
+from experiments.variants import stages_of
+
+FRAMES = (5, 9, 13)
+"""Lengths of clips; odd, as SS/ESS pairs need."""
+CROPS = (48, 64, 96)
+"""Sides of square crops, LR pixels."""
+BATCH = 2
+WIDTH = 24
+"""Of the networks: the paper preset's."""
+LOADED_STEPS = 40
+
+
+def _clip(length: int, side: int) -> Sequence:
+    """A batch of clips ``[T, B, H, W, C]`` of synthetic frames."""
+    frames = [inputs.frame(side, side, 100 * n) for n in range(length)]
+    stacked: Frame = jax.tree.map(lambda *leaves: np.stack(leaves).repeat(BATCH, axis=1), *frames)
+    reference = stacked.color.repeat(2, axis=-3).repeat(2, axis=-2)
+    return Sequence(frames=stacked, reference=reference)
+
+
+def _step_case(length: int, side: int) -> Case:
+    """The whole train step: both rollouts, all losses, gradient, Adam."""
+    config = make_config("quick", [f"width={WIDTH}", f"first_width={WIDTH}"])
+    stage = stages_of("extrass", config)[-1]
+    clip = _clip(length, side)
+    variables = stage.method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
+    transform = optimizer()
+    step = make_train_step(stage.objective, transform, stage.name)
+    # The state is donated inside; here it is an ordinary argument, so that a repetition starts where the last did.
+    return Case(
+        f"train step, {length} frames of {side}x{side}, batch {BATCH}",
+        lambda state, clip: step.__wrapped__(state, clip, 1e-4),
+        (create_state(variables, stage.name, transform), clip),
+        work={"frames": length * BATCH, "pixels": length * BATCH * side * side},
+    )
+
+
+def _unrolled_case(method: Method, *, remat: bool, gradient: bool) -> Case:
+    """``unroll`` alone over 8 frames; with its gradient, or forward only."""
+    clip = _clip(8, 64)
+    variables = method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
+
+    def loss(variables, frames):
+        return jnp.mean(jnp.log1p(unroll(method, variables, frames, alternate(), train=True, remat=remat).image) ** 2)
+
+    kind = "gradient" if gradient else "forward"
+    name = f"{kind} of 8 unrolled frames of 64x64, batch {BATCH}" + (", remat" if remat else "")
+    return Case(name, jax.grad(loss) if gradient else loss, (variables, clip.frames), work={"frames": 8 * BATCH})
+
+
+def rows(options: Options) -> Iterator[Row]:
+    """Steps of three lengths and three sizes, unrolled gradients, and training that reads its clips."""
+    repetitions = options.repetitions
+    for length, side in sorted({(length, CROPS[1]) for length in FRAMES} | {(FRAMES[1], side) for side in CROPS}):
+        yield measure(_step_case(length, side), repetitions)
+    method = stages_of("extrass", make_config("quick", [f"width={WIDTH}", f"first_width={WIDTH}"]))[-1].method
+    for remat, gradient in ((False, False), (False, True), (True, True)):
+        yield measure(_unrolled_case(method, remat=remat, gradient=gradient), repetitions)
+    yield _loaded()
+
+
+def _loaded() -> Row:
+    """A training loop on rendered clips from disk: what share of the time the step waits for its batch."""
+    config: Config = make_config("quick", [])
+    stage = stages_of("extrass", config)[-1]
+    with tempfile.TemporaryDirectory() as folder:
+        clips = plan("train", 1, config.train_frames, spp=1, families=["carousel"])
+        dataset = generate(Path(folder), clips, *config.size, scale=config.scale)
+        transform = optimizer()
+        step = make_train_step(stage.objective, transform, stage.name)
+        state = create_state(initial_variables([stage], dataset, config), stage.name, transform)
+        batches, waited, seconds = make_batches(dataset, config, stage), [], []
+        for n in range(LOADED_STEPS + 2):
+            start = time.perf_counter()
+            batch = next(batches)
+            ready = time.perf_counter()
+            state, terms = step(state, batch, 1e-4)
+            jax.device_get(terms)
+            if n >= 2:
+                waited.append(ready - start)
+                seconds.append(time.perf_counter() - start)
+    name = f"training, {config.clip} frames of {config.crop[0]}x{config.crop[1]}, batch {config.batch}, read from disk"
+    row = {"name": name, "implementation": "essjax", **summary(np.array(seconds))}
+    return {**row, "waiting_fraction": sum(waited) / sum(seconds), "work": {"frames": config.clip * config.batch}}
+
+
+def _fit(sizes: list[float], milliseconds: list[float]) -> tuple[float, float]:
+    """Least squares ``milliseconds = a + b sizes``: the share of a in the largest, and R²."""
+    slope, intercept = np.polyfit(sizes, milliseconds, 1)
+    residual = np.array(milliseconds) - (intercept + slope * np.array(sizes))
+    return intercept / max(milliseconds), 1.0 - residual.var() / np.var(milliseconds)
+
+
+def facts(rows: list[Row]) -> dict[str, float]:
+    """Linear fits in frames and pixels, rates of products, what remat costs, how long the step waits for data."""
+    steps = {row["name"]: row for row in rows if row["name"].startswith("train step")}
+    name = "train step, {} frames of {}x{}, batch " + str(BATCH)
+    by_frames = [steps[name.format(length, CROPS[1], CROPS[1])]["median_ms"] for length in FRAMES]
+    by_pixels = [steps[name.format(FRAMES[1], side, side)]["median_ms"] for side in CROPS]
+    frames_intercept, frames_r2 = _fit(list(FRAMES), by_frames)
+    pixels_intercept, pixels_r2 = _fit([side**2 for side in CROPS], by_pixels)
+    rates = {row["name"]: row["flops"] / row["median_ms"] / 1e6 for row in rows if "flops" in row}
+    forward, gradient, remat = [row for row in rows if "unrolled frames" in row["name"]]
+    return {
+        "fit in frames: R²": frames_r2,
+        "fit in frames: constant part of the longest": frames_intercept,
+        "fit in pixels: R²": pixels_r2,
+        "fit in pixels: constant part of the largest": pixels_intercept,
+        "GFLOP/s of the step with the largest crop": rates[name.format(FRAMES[1], CROPS[-1], CROPS[-1])],
+        "rate of products in the gradient over that of the forward pass": rates[gradient["name"]]
+        / rates[forward["name"]],
+        "time with remat over without": remat["median_ms"] / gradient["median_ms"],
+        "temporary memory with remat over without": remat["temporary_megabytes"] / gradient["temporary_megabytes"],
+        "share of training that waits for data": next(
+            row["waiting_fraction"] for row in rows if "waiting_fraction" in row
+        ),
+    }
