@@ -1,5 +1,6 @@
 """Motion fields: jitter difference, composition along the path, upsampling, dilation, splatting."""
 
+import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
@@ -119,7 +120,7 @@ def dilate_motion(motion: Motion, depth: Plane, *, radius: int = 1) -> Motion:
         closer = other < nearest
         nearest = jnp.where(closer, other, nearest)
         result = jnp.where(closer, _shifted(padded_motion, dy, dx, radius, height, width), result)
-    return result
+    return jax.lax.optimization_barrier(result)  # computed once, not again in every gather that reads it
 
 
 def splat_motion(values: Image, depth: Plane, motion: Motion) -> tuple[Image, Plane, Mask]:

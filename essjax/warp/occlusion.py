@@ -131,4 +131,5 @@ def hole_mask(
                 current, there, normal_threshold, position_threshold, depth_threshold, stencil_threshold
             )
             valid |= same & (row.weight * column.weight > _MIN_TAP_WEIGHT)[..., None]
-    return valid.astype(jnp.float32) * inside_mask(lookup)
+    # Computed once: fused into all that read it, the 4 taps would be fetched again for every read.
+    return jax.lax.optimization_barrier(valid.astype(jnp.float32) * inside_mask(lookup))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.typing import Array, Image, Jitter, Mask
+from essjax.warp.sampling import gather_pixels
 from essjax.warp.upsample import zero_upsample
 
 
@@ -57,9 +58,10 @@ def _tent_axis(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Arra
     return index, weight / jnp.where(total > 0, total, 1.0), jnp.zeros_like(total)
 
 
-def _take(image: Array, index: Array, axis: int) -> Array:
-    """Rows or columns of an image; every index is inside."""
-    return image.at[(slice(None),) * axis + (index,)].get(mode="promise_in_bounds")
+def _at(image: Array, rows: Array, columns: Array) -> Array:
+    """``[len(rows), len(columns), C]``: what a grid of pixels shows. One flat gather: one along columns transposes."""
+    index = rows[:, None] * image.shape[1] + columns
+    return gather_pixels(image.reshape(-1, image.shape[-1]), index)
 
 
 def _of_three(image: Array, axis: int, merge: Callable) -> Array:
@@ -83,15 +85,15 @@ def _resample_one(color: Array, bounded: Array, jitter: Array, axis: Callable) -
     rows = jnp.clip(rows, 0, height - 1).astype(jnp.int32)
     # Barriers: fused into what reads it three times, each stage would be computed three times for every pixel.
     columns, column_weight, rows, row_weight = jax.lax.optimization_barrier((columns, column_weight, rows, row_weight))
+    weight = jax.lax.optimization_barrier(jnp.exp(row_log))[:, None, None] * jnp.exp(column_log)[:, None]
     # The kernel of a grid is a product: rows first, then columns.
-    tall = sum(_take(color, rows[k], 0) * row_weight[k][:, None, None] for k in range(3))
-    tall = jax.lax.optimization_barrier(tall)
-    mean = sum(_take(tall, columns[k], 1) * column_weight[k][:, None] for k in range(3))
+    tall = sum(_at(color, rows[k], jnp.arange(width)) * row_weight[k][:, None, None] for k in range(3))
+    tall = jnp.asarray(jax.lax.optimization_barrier(tall))
+    every_row = jnp.arange(tall.shape[0])
+    mean = sum(_at(tall, every_row, columns[k]) * column_weight[k][:, None] for k in range(3))
     # The nine samples around an output pixel are those around its nearest one: found at low resolution.
-    boxes = jnp.concatenate([_of_three(_of_three(bounded, 0, merge), 1, merge) for merge in _MERGES], axis=-1)
-    boxes = _take(_take(jax.lax.optimization_barrier(boxes), rows[0], 0), columns[0], 1)
-    low, high, average = jnp.split(boxes, 3, axis=-1)
-    weight = jnp.exp(row_log[:, None, None] + column_log[None, :, None])
+    boxes = jax.lax.optimization_barrier([_of_three(_of_three(bounded, 0, merge), 1, merge) for merge in _MERGES])
+    low, high, average = (_at(box, rows[0], columns[0]) for box in boxes)
     return Resampled(jnp.asarray(mean), weight, low, high, average)
 
 

@@ -90,7 +90,8 @@ def _along(image: Array, taps: list[Tap], axis: int) -> Array:
     """Interpolate a ``[H, W, C]`` image along axis 0 or 1 at the taps' positions."""
     shape = (-1, 1, 1) if axis == 0 else (1, -1, 1)
     return sum(
-        jnp.take(image, tap.index, axis=axis, mode="clip").astype(jnp.float32) * tap.weight.reshape(shape)
+        image.at[(slice(None),) * axis + (tap.index,)].get(mode="promise_in_bounds").astype(jnp.float32)
+        * tap.weight.reshape(shape)
         for tap in taps
     )  # type: ignore[return-value]
 
@@ -121,6 +122,7 @@ def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode:
 
     def one(image: Array, jitter: Array) -> Array:
         wide = _along(image, axis_taps(columns - jitter[0], width, mode, "border"), axis=1)
+        wide = jax.lax.optimization_barrier(wide)  # else every tap along the other axis computes it again
         return _along(wide, axis_taps(rows - jitter[1], height, mode, "border"), axis=0).astype(image.dtype)
 
     return over_leading_axes(one, (3, 1), image, jnp.asarray(jitter))
