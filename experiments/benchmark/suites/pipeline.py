@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from essjax import methods
+from essjax.deploy import count_parameters
 from essjax.frames import without_color
 from essjax.interfaces import Method
 from essjax.rollout import ESS, SS, alternate, every, stream_step, unroll
@@ -81,7 +82,7 @@ def rows(options: Options) -> Iterator[Row]:
     frames = inputs.frames(DISTINCT, options.width, options.height)
     for name, method in streamed_methods().items():
         variables = jax.jit(method.init)(jax.random.key(0), frames[0])
-        for dtype in options.dtypes if variables else ("float32",):
+        for dtype in options.dtypes if count_parameters(variables) else ("float32",):
             yield from _method_rows(name, method, variables, frames, dtype, options)
 
 
