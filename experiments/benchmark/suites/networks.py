@@ -12,7 +12,7 @@ from essjax.interfaces import Network
 from essjax.networks import compute_dtype
 from essjax.networks.extranet import input_shapes
 from essjax.networks.nsrr import FEATURES, PREVIOUS
-from experiments.benchmark import inputs
+from experiments.benchmark import inputs, peers
 from experiments.benchmark.measure import Case, measure
 from experiments.benchmark.suites import Options, Row
 
@@ -93,6 +93,8 @@ def rows(options: Options) -> Iterator[Row]:
     for forward in forwards(options.width, options.height):
         for dtype in options.dtypes:
             made = case(forward, dtype)
-            yield {
-                **measure(made, options.repetitions), "dtype": dtype, "parameters": count_parameters(made.arguments[0])
-            }  # fmt: skip
+            parameters = count_parameters(made.arguments[0])
+            yield {**measure(made, options.repetitions), "dtype": dtype, "parameters": parameters}
+            if options.peers:
+                for row in peers.rows(made, options.repetitions, dtype):
+                    yield {**row, "dtype": dtype}

@@ -21,7 +21,7 @@ from essjax.warp import (
     splat_nearest,
     upsample_motion,
 )
-from experiments.benchmark import inputs
+from experiments.benchmark import inputs, peers
 from experiments.benchmark.measure import Case, measure
 from experiments.benchmark.suites import Options, Row
 
@@ -47,7 +47,7 @@ def cases(width: int, height: int) -> list[Case]:
         ("gradient of bilinear", gradient("bilinear"), (image, motion)),
         ("gradient of bicubic", gradient("bicubic"), (image, motion)),
         ("splat", splat, (image, motion)),
-        ("splat, nearest depth wins", splat_nearest, (image, depth, motion)),
+        ("splat of the nearest depth", splat_nearest, (image, depth, motion)),
         ("guided", gbuffer_guided_warp, (image, *guide_pair, motion)),
         ("occlusion motion", occlusion_motion, (motion, depth, hole)),
         ("dilated motion", dilate_motion, (motion, depth)),
@@ -60,10 +60,12 @@ def cases(width: int, height: int) -> list[Case]:
 
 
 def _resample(image, jitter):
-    return gaussian_resample(image, image, jitter, jnp.float32(0.65), 2).color
+    return gaussian_resample(image, image, jitter, jnp.float32(0.65), 2)
 
 
 def rows(options: Options) -> Iterator[Row]:
     """Ours, then the peers of each case."""
     for case in cases(options.width, options.height):
         yield measure(case, options.repetitions)
+        if options.peers:
+            yield from peers.rows(case, options.repetitions)
