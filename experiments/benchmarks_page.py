@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.benchmark.section import section
 from experiments.tables import get_table, markdown
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -89,7 +90,7 @@ def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def page(results: list[tuple[str, dict[str, Any]]]) -> str:
     """The whole page."""
-    sections = {"import": _import_section, "tables": _tables_section}
+    sections = {"import": _import_section, "tables": _tables_section, "benchmark": section}
     return "\n".join(
         [HEAD, *(sections.get(metrics.get("kind", ""), _section)(name, metrics) for name, metrics in results)]
     )

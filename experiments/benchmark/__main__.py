@@ -59,23 +59,28 @@ def _benchmark(options: argparse.Namespace, console: Console) -> int:
         )
     if options.device not in (None, "cpu", "gpu"):
         raise ValueError(f"--device: expected cpu or gpu, got {options.device!r}.")
+    dtypes = ("float32", "bfloat16", "float16")
+    unknown = [name for name in options.dtypes if name not in dtypes]
+    if unknown:
+        raise ValueError(f"--dtypes: expected some of {', '.join(dtypes)}, got {', '.join(unknown)}.")
     if options.device:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[options.device]
     # Imported here: a typing error should not wait for JAX, and JAX reads its platform once.
     import jax
 
-    from experiments.benchmark import machine, schema
-    from experiments.benchmark.suites import Options, load
+    from experiments.benchmark import machine, schema, suites
     from experiments.benchmarks_page import RESULTS
     from experiments.environment import environment
     from experiments.experiment import write_json
 
-    settings = Options(width, height, options.repetitions, options.frames, not options.no_peers, tuple(options.dtypes))
+    settings = suites.Options(
+        width, height, options.repetitions, options.frames, not options.no_peers, tuple(options.dtypes)
+    )
     out, load_average = options.out or RESULTS, os.getloadavg()[0]
     out.mkdir(parents=True, exist_ok=True)
     limits = machine.roofline(options.repetitions)
     for name in options.suite:
-        suite, rows = load()[name], []
+        suite, rows = suites.load()[name], []
         for row in suite.rows(settings):
             if "flops" in row:
                 row["roofline_fraction"] = machine.roofline_fraction(row, limits, row.get("dtype", "float32"))
