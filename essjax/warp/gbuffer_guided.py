@@ -76,7 +76,7 @@ def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) ->
 
 def _best_by_network(keys: list[Array]) -> list[Array]:
     """The four smallest, in order: each key in turn passes four minima."""
-    best = [jnp.full_like(keys[0], np.iinfo(np.int32).max)] * WINNERS
+    best: list[Array] = [jnp.full_like(keys[0], np.iinfo(np.int32).max)] * WINNERS
     for key in keys:
         kept = []
         for other in best:

@@ -90,7 +90,7 @@ def _along(image: Array, taps: list[Tap], axis: int) -> Array:
     """Interpolate a ``[H, W, C]`` image along axis 0 or 1 at the taps' positions."""
     shape = (-1, 1, 1) if axis == 0 else (1, -1, 1)
     return sum(
-        image.at[(slice(None),) * axis + (tap.index,)].get(mode="promise_in_bounds").astype(jnp.float32)
+        jnp.asarray(image).at[(slice(None),) * axis + (tap.index,)].get(mode="promise_in_bounds").astype(jnp.float32)
         * tap.weight.reshape(shape)
         for tap in taps
     )  # type: ignore[return-value]

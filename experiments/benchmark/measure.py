@@ -55,11 +55,11 @@ class Compilations:
         """Stop counting."""
         jax.monitoring.unregister_event_duration_listener(self._listen)
 
-    def _listen(self, event: str, duration: float, **_):
+    def _listen(self, event: str, duration_secs: float, **_: str | int):
         if event == _COMPILE_EVENT:
             self.count += 1
         if event == _COMPILE_EVENT or event in _LOWERING_EVENTS:
-            self.seconds += duration
+            self.seconds += duration_secs
 
 
 def time_calls(call: Callable[[], Any], repetitions: int, *, warm_up: int = WARM_UP) -> np.ndarray:

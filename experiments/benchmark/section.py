@@ -7,8 +7,8 @@ from experiments.benchmark.schema import check
 NOTES = {
     "warp": "One image `[H, W, 3]`, float32. The guided warp reads 6 guide channels.",
     "networks": "One frame, weights as arguments. FLOP: two per multiply-add of convolutions and matrix products.",
-    "pipeline": "Whole methods, frame by frame: the frame to the device and the image back included, history donated, any "
-    "other transfer refused. Difference: largest between streamed and unrolled images, over their mean.",
+    "pipeline": "Whole methods, frame by frame: the frame to the device and the image back included, history donated, "
+    "any other transfer refused. Difference: largest between streamed and unrolled images, over their mean.",
     "train": "Both rollouts of ExtraSS, all losses, gradient and Adam; networks of 24 channels.",
     "scenes": "The built-in renderer, from outside: many jitted pieces.",
 }

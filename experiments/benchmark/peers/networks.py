@@ -41,10 +41,10 @@ def _merge(tree: Weights, other: Weights) -> None:
             tree[name] = value
 
 
-def conv(x, p: Weights, stride: int = 1, padding: int | None = None):
+def conv(x, p: Weights, stride: int = 1, padding: Any = None):
     """NCHW; as ``networks.blocks.conv``."""
     padding = (p["kernel"].shape[-1] - 1) // 2 if padding is None else padding
-    return F.conv2d(x, p["kernel"], p["bias"], stride, padding)
+    return F.conv2d(x, p["kernel"], p["bias"], stride=stride, padding=padding)
 
 
 def replicated(x, p: Weights):

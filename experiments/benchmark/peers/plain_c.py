@@ -29,7 +29,7 @@ def build(folder: Path) -> Callable:
     subprocess.run([compiler() or "gcc", *FLAGS, str(SOURCE), "-o", str(library), "-lm"], check=True)
     function = ctypes.CDLL(str(library)).guided_warp
     offsets = np.ascontiguousarray(candidate_offsets(), np.int32)
-    inverse = np.float32([*SIGMA_GUIDE, SIGMA_DISTANCE]) ** -2
+    inverse = np.array([*SIGMA_GUIDE, SIGMA_DISTANCE], np.float32) ** -2
 
     def warp(radiance, guide_previous, guide, motion, out):
         arrays = (radiance, guide_previous, guide, motion, offsets, inverse, out)

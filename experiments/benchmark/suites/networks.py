@@ -52,7 +52,7 @@ def forwards(width: int, height: int) -> list[Forward]:
     fasset = (*(_shape(*low, n) for n in (3, 1, 7, 24)), _shape(1, 2))
     features = _shape(*low, 4), _shape(*high, FEATURES), _shape(PREVIOUS, *high, FEATURES)
     frnet = _shape(2, *half, 3), _shape(*half, 1)
-    extranet = input_shapes(1, **native)
+    extranet = input_shapes(1, height=native["height"], width=native["width"])
     extrassnet = networks.extrassnet()
 
     def forward(name, network, shapes, pixels, *, method=None, given=None):

@@ -35,7 +35,7 @@ def _clip(length: int, side: int) -> Sequence:
     """A batch of clips ``[T, B, H, W, C]`` of synthetic frames."""
     frames = [inputs.frame(side, side, 100 * n) for n in range(length)]
     stacked: Frame = jax.tree.map(lambda *leaves: np.stack(leaves).repeat(BATCH, axis=1), *frames)
-    reference = stacked.color.repeat(2, axis=-3).repeat(2, axis=-2)
+    reference = np.asarray(stacked.color).repeat(2, axis=-3).repeat(2, axis=-2)
     return Sequence(frames=stacked, reference=reference)
 
 

@@ -35,7 +35,7 @@ def test_donated_state_goes_from_call_to_call():
     seen = []
 
     def following(arguments, output):
-        seen.append(float(output[0]))
+        seen.append(float(np.asarray(output)[0]))
         return (output,)
 
     measure(Case("count", lambda x: x + 1.0, (jnp.zeros(3),), donate=(0,), following=following), 2)
@@ -57,7 +57,8 @@ def test_networks_are_those_of_the_methods(forward):
     made = {
         "ExtraSSNet": (methods.extrass(), "extrassnet"), "FRNet": (methods.extrass_e(), "frnet"),
         "ExtraNet": (methods.extranet(), "extranet"), "DLCTUS": (methods.dlctus(), "dlctus"),
-        "FASSET": (methods.fasset(), "fasset"), "IFRNet": (methods.ifrnet(), "ifrnet"), "NSRR": (methods.nsrr(), "nsrr"),
+        "FASSET": (methods.fasset(), "fasset"), "IFRNet": (methods.ifrnet(), "ifrnet"),
+        "NSRR": (methods.nsrr(), "nsrr"),
     }  # fmt: skip
     method, entry = made[forward.name.split(",")[0].split(" ")[0]]
     key = jax.random.key(0)
@@ -100,7 +101,9 @@ def result():
     peer |= {"implementation": "torch eager", "median_ms": 5.0, "difference_from_essjax": 1e-6}
     return {
         "schema": 1, "kind": "benchmark", "suite": "warp", "rows": [row, peer], "facts": {"a ratio": 1.25},
-        "environment": {"commit": "abc", "date": "2026-01-01", "device": "cpu", "versions": {"jax": "0", "python": "3"}},
+        "environment": {
+            "commit": "abc", "date": "2026-01-01", "device": "cpu", "versions": {"jax": "0", "python": "3"},
+        },
         "machine": {
             "copy_bytes_per_second": 1e10, "float32_flops_per_second": 1e11, "bfloat16_flops_per_second": 2e11,
             "load_at_start": 0.5,
