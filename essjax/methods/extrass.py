@@ -8,7 +8,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from essjax.color import expm1, log1p, rgb_to_ycocg, ycocg_to_rgb
+from essjax.color import expm1, log1p, rgb_to_ycocg, sum_channels, ycocg_to_rgb
 from essjax.frames import (
     Frame,
     GBuffers,
@@ -108,17 +108,22 @@ def refine(network: Network, variables: PyTree, warped: Color, gbuffers: GBuffer
     return {"image": image, "half": refined, "flow": output["flow"], "features": output["features"], "mask": mask}
 
 
+def _length(vectors: Array) -> Array:
+    """``[..., 1]``; for comparisons only: at 0 it has no derivative."""
+    return jnp.sqrt(sum_channels(vectors**2))
+
+
 def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: float = REFINE_DELTA) -> Mask:
     """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear)."""
     base, normal = surface_guides(gbuffers)
     base_half, normal_half = _enlarge(halve(base), base), _enlarge(halve(normal), normal)
-    distance = jnp.linalg.norm(base_half - base, axis=-1, keepdims=True) / jnp.sqrt(3.0)
-    similar = (1.0 - distance) * jnp.sum(normal_half * normal, axis=-1, keepdims=True) > delta
+    distance = _length(base_half - base) / jnp.sqrt(3.0)
+    similar = (1.0 - distance) * sum_channels(normal_half * normal) > delta
     large = _enlarge(refined, warped)
-    norm = jnp.maximum(jnp.linalg.norm(large, axis=-1, keepdims=True), 1e-3)
+    norm = jnp.maximum(_length(large), 1e-3)
     # FRNet may only act where it changed something: its input, downsampled and enlarged, is what it started from.
     before = _enlarge(halve(warped), warped)
-    changed = jnp.linalg.norm(large - before, axis=-1, keepdims=True) / norm > delta
+    changed = _length(large - before) / norm > delta
     return (similar & changed).astype(warped.dtype)
 
 

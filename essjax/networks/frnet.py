@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax.color import sum_channels
 from essjax.interfaces import Network
 from essjax.networks.blocks import ConvBlock, bilinear_upsample, conv, crop, mean_pool, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen
@@ -45,8 +46,8 @@ def matched_flow(warped: Image, roughness: Plane) -> Image:
 
     def cost(offset: jax.Array) -> jax.Array:
         flow = jnp.broadcast_to(offset, (*newest.shape[:-1], 2))
-        difference = jnp.mean(jnp.abs(backward_warp(newest, flow) - backward_warp(older, 3.0 * flow)), axis=-1)
-        return _box(difference) + price * jnp.linalg.norm(offset)
+        difference = jnp.abs(backward_warp(newest, flow) - backward_warp(older, 3.0 * flow))
+        return _box(sum_channels(difference)[..., 0] / difference.shape[-1]) + price * jnp.linalg.norm(offset)
 
     costs = jax.lax.map(cost, jnp.asarray(OFFSETS, newest.dtype))
     weights = jax.nn.softmax(-costs / TEMPERATURE, axis=0)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
+from essjax.color import sum_channels
 from essjax.frames import GBuffers
 from essjax.typing import Array, Jitter, Mask, Motion, Plane
 from essjax.warp._batch import check_channels
@@ -45,8 +46,8 @@ def _agreement(a: Array | None, b: Array | None) -> Array:
     """Cosine between two normals; 1 where one of them is missing (no buffer, zero vector)."""
     if a is None or b is None:
         return jnp.ones(())
-    lengths = jnp.sqrt(jnp.sum(a * a, -1, keepdims=True) * jnp.sum(b * b, -1, keepdims=True))
-    return jnp.where(lengths > 1e-6, jnp.sum(a * b, -1, keepdims=True) / jnp.maximum(lengths, 1e-6), 1.0)
+    lengths = jnp.sqrt(sum_channels(a * a) * sum_channels(b * b))
+    return jnp.where(lengths > 1e-6, sum_channels(a * b) / jnp.maximum(lengths, 1e-6), 1.0)
 
 
 def _same_surface(
@@ -61,7 +62,8 @@ def _same_surface(
     if current.world_position is not None and previous.world_position is not None:
         n_dot_v = _TYPICAL_N_DOT_V if current.n_dot_v is None else jnp.maximum(current.n_dot_v, _MIN_N_DOT_V)
         footprint = depth / (current.depth.shape[-3] * n_dot_v)
-        moved = jnp.linalg.norm(current.world_position - previous.world_position, axis=-1, keepdims=True)
+        difference = current.world_position - previous.world_position
+        moved = jnp.sqrt(sum_channels(difference**2))
         static = moved <= position_threshold * footprint
     else:
         static = normals & depths
