@@ -10,6 +10,7 @@ from essjax.generate import generate, plan
 from essjax.rollout import ESS, SS, stream_step
 from essjax.train import create_state, make_train_step, optimizer
 from experiments.config import Config
+from experiments.trace import describe, operations
 from experiments.training import initial_variables, make_batches
 from experiments.variants import get_variant, stages_of
 
@@ -54,6 +55,8 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
                 with jax.profiler.StepTraceAnnotation("train", step_num=repetition):
                     state, terms = step(state, batch, stage.learning_rate)
                     jax.block_until_ready(terms)
+    for line in describe(operations(folder)):
+        console.print(line, soft_wrap=True, highlight=False)
     console.print(
         f"trace: {folder}\nOpen it with `pip install xprof && xprof --logdir {folder}`, or load its *.trace.json.gz in "
         "Perfetto.",
