@@ -91,3 +91,9 @@ def test_strict_numerics(strict_numerics):
     for encode, decode, _ in PAIRS.values():
         assert decode(encode(image)).dtype == jnp.float32
     assert color.display(image).dtype == color.luminance(image).dtype == jnp.float32
+
+
+def test_sum_channels_by_hand():
+    image = np.array([[[1.0, 2.0, 4.0], [-1.0, 0.5, 0.25]]], np.float32)
+    np.testing.assert_array_equal(color.sum_channels(image), [[[7.0], [-0.25]]])
+    np.testing.assert_array_equal(color.sum_channels(image[..., :1]), image[..., :1])

@@ -151,6 +151,14 @@ def test_network_depth_by_hand():
         assert float(fr.depth_scale(nothing)) == 1.0
 
 
+def test_depth_scale_of_a_large_image_takes_every_kth_row_and_column():
+    """150 x 200: rows 0, 2, 4 ..., columns 0, 3, 6 ...; the others are wrong here and must not count."""
+    depth = np.full((150, 200, 1), 1e6, np.float32)
+    depth[::2, ::3] = np.random.default_rng(0).uniform(1, 9, (75, 67, 1))
+    gbuffers = fr.GBuffers(base_color=None, normal=None, depth=depth)
+    np.testing.assert_allclose(fr.depth_scale(gbuffers), np.median(depth[::2, ::3]), rtol=1e-6)
+
+
 def test_depth_scale_is_per_image():
     frames = make_frames(2, T=2, B=3)
     each = fr.depth_scale(frames.gbuffers)

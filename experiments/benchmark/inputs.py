@@ -1,5 +1,7 @@
 """Frames to time methods on, of any size, no renderer needed: edges, smooth and still motion, as rendered ones have."""
 
+import dataclasses
+
 import jax
 import numpy as np
 
@@ -56,7 +58,7 @@ def _leaf(name: str, leaf: jax.ShapeDtypeStruct, seed: int) -> np.ndarray:
 def frames(count: int, width: int, height: int) -> list[Frame]:
     """Different frames; the first follows a cut."""
     made = [frame(width, height, 100 * n) for n in range(count)]
-    made[0] = made[0].replace(cut=np.ones(1, bool))  # type: ignore[attr-defined]
+    made[0] = dataclasses.replace(made[0], cut=np.ones(1, bool))
     return made
 
 

@@ -10,7 +10,6 @@ import jax.monitoring
 import numpy as np
 
 from essjax.deploy import multiply_adds
-from essjax.typing import PyTree
 
 REPETITIONS = 20
 WARM_UP = 2
@@ -130,8 +129,3 @@ def _program(compiled: Any, case: Case) -> dict[str, Any]:
         "xla_flops": float(analysis.get("flops", 0.0)),
         "flops": float(products or analysis.get("flops", 0.0)),
     }
-
-
-def bytes_of(tree: PyTree) -> int:
-    """Size of all arrays in a tree."""
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
