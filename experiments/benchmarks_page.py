@@ -135,6 +135,8 @@ def _tables_section(name: str, content: dict[str, Any]) -> str:
             f"steps: {steps}.",
             "",
         ]
+    for remark in content.get("remarks", ()):  # written into the file by hand: what a reader of these numbers must know
+        lines += [remark, ""]
     return "\n".join([*lines, *(markdown(get_table(key), ours) for key, ours in content["tables"].items())])
 
 

@@ -40,8 +40,8 @@ def _table(rows: list[dict[str, Any]]) -> list[str]:
     ours = {(row["name"], row.get("dtype")): row["median_ms"] for row in rows if row["implementation"] == "essjax"}
     columns = {
         "by": lambda row: row["implementation"] + (f", {row['dtype']}" if "dtype" in row else ""),
-        "median, ms": lambda row: f"{row['median_ms']:.3g}",
-        "IQR, ms": lambda row: f"{row['iqr_ms']:.2g}",
+        "median, ms": lambda row: _short(row["median_ms"]),
+        "IQR, ms": lambda row: _short(row["iqr_ms"], 2),
         "over essjax": lambda row: _ratio(row, ours),
         "rate": _rate,
         "GFLOP/s": lambda row: _per_second(row, "flops", 1e9),
@@ -59,6 +59,11 @@ def _table(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
+def _short(value: float, digits: int = 3) -> str:
+    """Significant digits, without an exponent."""
+    return f"{value:.{digits}g}" if value < 10**digits else f"{value:.0f}"
+
+
 def _ratio(row: dict[str, Any], ours: dict[tuple, float]) -> str:
     if row["implementation"] == "essjax":
         return ""
@@ -70,14 +75,14 @@ def _rate(row: dict[str, Any]) -> str:
     if not unit:
         return ""
     rate = amount / (1e-3 * row["median_ms"])
-    return f"{rate:.3g} {unit}/s" if rate < 1e4 else f"{rate / 1e6:.3g} M{unit}/s"
+    return f"{_short(rate)} {unit}/s" if rate < 1e4 else f"{_short(rate / 1e6)} M{unit}/s"
 
 
 def _per_second(row: dict[str, Any], key: str, unit: float) -> str:
     # Warps hold no products: what XLA counts there is mostly index arithmetic.
     if row.get(key, 0.0) < 1e8:
         return ""
-    return f"{row[key] / (1e-3 * row['median_ms']) / unit:.3g}"
+    return _short(row[key] / (1e-3 * row["median_ms"]) / unit)
 
 
 def _latency(row: dict[str, Any]) -> str:
