@@ -18,7 +18,7 @@ from experiments.training import initial_variables, make_batches
 from experiments.variants import VARIANTS, config_of, stages_of
 
 pytestmark = pytest.mark.skipif(
-    not os.environ.get("ESSJAX_SWEEP"), reason="compiles every variant, seven minutes: set ESSJAX_SWEEP=1 to run it"
+    not os.environ.get("ESSJAX_SWEEP"), reason="compiles every variant, four minutes: ESSJAX_SWEEP=1, --dist load"
 )
 STEPS = 8
 SIZES = ["size=[40,28]", "crop=[32,24]", "test_frames=7", "train_frames=7"]
