@@ -47,7 +47,8 @@ def matched_flow(warped: Image, roughness: Plane) -> Image:
     def cost(offset: jax.Array) -> jax.Array:
         flow = jnp.broadcast_to(offset, (*newest.shape[:-1], 2))
         difference = jnp.abs(backward_warp(newest, flow) - backward_warp(older, 3.0 * flow))
-        return _box(jnp.asarray(sum_channels(difference)[..., 0]) / difference.shape[-1]) + price * jnp.linalg.norm(offset)
+        mean = jnp.asarray(sum_channels(difference)[..., 0]) / difference.shape[-1]
+        return _box(mean) + price * jnp.linalg.norm(offset)
 
     costs = jax.lax.map(cost, jnp.asarray(OFFSETS, newest.dtype))
     weights = jax.nn.softmax(-costs / TEMPERATURE, axis=0)
