@@ -19,6 +19,9 @@ MAX_WEIGHT = 10.0
 """Feature weights lie in (0, MAX_WEIGHT)."""
 _UNIT_WEIGHT = -1.0986123  # MAX_WEIGHT / 2 * (1 + tanh(this)) = 1
 LEVELS = 3
+OUTPUT_GAIN = 0.1
+"""RenderINR's output is scaled by this: Adam moves the weights of its last layer, which start at zero, all the same way
+at first; unscaled, a step changes the colour by so much that training shuts the features off through their weights."""
 
 
 class ConvGRU(nn.Module):
@@ -122,7 +125,7 @@ class RenderINR(nn.Module):
         x = x + dense(self.hidden, use_bias=False, kernel_init=nn.initializers.zeros, name="pixel_size")(pixel_size)
         for _ in range(2):
             x = dense(self.hidden, kernel_init=kernel_bound)(nn.relu(x))
-        return dense(3, kernel_init=nn.initializers.zeros)(nn.relu(x))
+        return OUTPUT_GAIN * dense(3, kernel_init=nn.initializers.zeros)(nn.relu(x))
 
 
 class FASSET(nn.Module):

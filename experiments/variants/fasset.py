@@ -17,7 +17,7 @@ EPOCHS, EPOCHS_PER_HALVING = 150, 30
 """Of the paper (section 3.4)."""
 PRESETS = {
     "smoke": {"occlusion_weight": 5.0},
-    "quick": {"batch": 2, "learning_rate": 6e-4, "occlusion_weight": 5.0, "seconds": 290.0},
+    "quick": {"batch": 2, "learning_rate": 2e-3, "occlusion_weight": 0.3, "seconds": 290.0},
     "paper": {"batch": 8, "learning_rate": 1e-3, "occlusion_weight": 5.0, "steps": EPOCHS * 900},
 }
 
