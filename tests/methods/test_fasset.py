@@ -148,7 +148,7 @@ def test_streaming_equals_the_rollout(busy):
     streamed = stream(METHOD, busy, frames, alternate(0).kinds(T))
     image = rollout()(busy, frames)
     assert image.shape == (T, B, 45, 60, 3)
-    np.testing.assert_allclose(log1p(image), log1p(streamed), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(log1p(image), log1p(streamed), rtol=1e-3, atol=1e-4)
     assert bool(jnp.all(jnp.isfinite(image))) and float(image.min()) >= 0.0
 
 
@@ -178,16 +178,16 @@ def test_history_ends_at_a_cut(busy):
     changed = dataclasses.replace(frames, gbuffers=before, color=frames.color.at[:2].multiply(1.5))
     image, other = rollout()(busy, frames), rollout()(busy, changed)
     np.testing.assert_array_equal(other[2:, 0], image[2:, 0])
-    assert float(jnp.abs(other[2:, 1] - image[2:, 1]).max(axis=(1, 2, 3)).min()) > 1e-3  # no cut there
+    assert float(jnp.abs(other[2:, 1] - image[2:, 1]).max(axis=(1, 2, 3)).min()) > 3e-4  # no cut there
     started = stream(METHOD, busy, select_time(frames, slice(2, 4)), (SS, ESS))
-    np.testing.assert_allclose(log1p(image[2:, 0]), log1p(started[:, 0]), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(log1p(image[2:, 0]), log1p(started[:, 0]), rtol=1e-3, atol=1e-4)
 
 
 def test_batch_elements_are_independent(busy):
     frames, others = random_frames(5), random_frames(6)
     mixed = jax.tree.map(lambda a, b: a.at[:, 1].set(b[:, 1]), frames, others)
     image, other = rollout()(busy, frames), rollout()(busy, mixed)
-    np.testing.assert_allclose(log1p(other[:, 0]), log1p(image[:, 0]), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(log1p(other[:, 0]), log1p(image[:, 0]), rtol=1e-4, atol=1e-5)
     assert float(jnp.abs(other[:, 1] - image[:, 1]).max()) > 0.1
 
 
