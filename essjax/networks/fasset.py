@@ -20,8 +20,8 @@ MAX_WEIGHT = 10.0
 _UNIT_WEIGHT = -1.0986123  # MAX_WEIGHT / 2 * (1 + tanh(this)) = 1
 LEVELS = 3
 OUTPUT_GAIN = 0.1
-"""RenderINR's output is scaled by this: its last layer starts at zero, so Adam's first steps move all its weights the same
-way; unscaled, at a learning rate of 2e-3, the loss rises above the untrained network's at first."""
+"""RenderINR's output is scaled by this: its last layer starts at zero, so Adam's first steps move all its weights
+the same way; unscaled, at a learning rate of 2e-3, the loss rises above the untrained network's at first."""
 
 
 class ConvGRU(nn.Module):
