@@ -12,6 +12,7 @@ from essjax import scenes
 from essjax.color import log1p
 from essjax.frames import GBuffers, select_time
 from essjax.methods import fasset, gaussian_blur
+from essjax.networks.fasset import OUTPUT_GAIN
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
 from essjax.scenes.render import render_reference
 from essjax.warp import hole_mask
@@ -40,7 +41,10 @@ def busy():
     """Variables none of which is zero: every layer has its say. Made without compiling ``init``."""
     shapes = jax.eval_shape(METHOD.init, jax.random.key(0), select_time(random_frames(), 0))
     rng = np.random.default_rng(0)
-    return jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.normal(size=leaf.shape), jnp.float32), shapes)
+    variables = jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.normal(size=leaf.shape), jnp.float32), shapes)
+    last = variables["fasset"]["params"]["inr"]["Dense_3"]
+    last.update({name: value / OUTPUT_GAIN for name, value in last.items()})
+    return variables
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +152,7 @@ def test_streaming_equals_the_rollout(busy):
     streamed = stream(METHOD, busy, frames, alternate(0).kinds(T))
     image = rollout()(busy, frames)
     assert image.shape == (T, B, 45, 60, 3)
-    np.testing.assert_allclose(log1p(image), log1p(streamed), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(log1p(image), log1p(streamed), rtol=1e-3, atol=1e-3)
     assert bool(jnp.all(jnp.isfinite(image))) and float(image.min()) >= 0.0
 
 
@@ -178,16 +182,16 @@ def test_history_ends_at_a_cut(busy):
     changed = dataclasses.replace(frames, gbuffers=before, color=frames.color.at[:2].multiply(1.5))
     image, other = rollout()(busy, frames), rollout()(busy, changed)
     np.testing.assert_array_equal(other[2:, 0], image[2:, 0])
-    assert float(jnp.abs(other[2:, 1] - image[2:, 1]).max(axis=(1, 2, 3)).min()) > 3e-4  # no cut there
+    assert float(jnp.abs(other[2:, 1] - image[2:, 1]).max(axis=(1, 2, 3)).min()) > 1e-3  # no cut there
     started = stream(METHOD, busy, select_time(frames, slice(2, 4)), (SS, ESS))
-    np.testing.assert_allclose(log1p(image[2:, 0]), log1p(started[:, 0]), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(log1p(image[2:, 0]), log1p(started[:, 0]), rtol=1e-3, atol=1e-3)
 
 
 def test_batch_elements_are_independent(busy):
     frames, others = random_frames(5), random_frames(6)
     mixed = jax.tree.map(lambda a, b: a.at[:, 1].set(b[:, 1]), frames, others)
     image, other = rollout()(busy, frames), rollout()(busy, mixed)
-    np.testing.assert_allclose(log1p(other[:, 0]), log1p(image[:, 0]), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(log1p(other[:, 0]), log1p(image[:, 0]), rtol=1e-4, atol=1e-4)
     assert float(jnp.abs(other[:, 1] - image[:, 1]).max()) > 0.1
 
 

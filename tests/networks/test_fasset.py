@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from essjax.networks import fasset
-from essjax.networks.fasset import RenderINR, Reweighting
+from essjax.networks.fasset import OUTPUT_GAIN, RenderINR, Reweighting
 from tests.helpers import random_image
 
 
@@ -57,7 +57,7 @@ def test_render_inr_equals_numpy():
     x = np.concatenate([latents, np.full((2, 3, 5, 1), 0.4)], axis=-1) @ stacked + layers["Dense_0"]["bias"]
     for name in ("Dense_1", "Dense_2", "Dense_3"):
         x = np.maximum(x, 0) @ layers[name]["kernel"] + layers[name]["bias"]
-    np.testing.assert_allclose(module.apply(variables, latents, jnp.full(1, 0.4)), 0.1 * x, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(10 * module.apply(variables, latents, jnp.full(1, 0.4)), x, rtol=1e-4, atol=1e-5)
 
 
 def test_feature_weights_start_at_one_and_stay_between_zero_and_ten():
@@ -122,10 +122,10 @@ def test_latents_are_read_where_the_samples_lie(tiny, scale, jitter, first, step
 
     def run(scale, jitter, kernel):
         variables["params"]["inr"]["pixel_size"]["kernel"] = kernel
-        return np.asarray(outputs_at(scale)(variables, *given, jnp.full((2, 2), jitter)))
+        return np.asarray(outputs_at(scale)(variables, *given, jnp.full((2, 2), jitter))) / OUTPUT_GAIN
 
     low = run(1, 0.0, pixel_size / scale)[:, low_first::low_step, low_first::low_step]
     high = run(scale, jitter, pixel_size)[:, first::step, first::step]
     rows, columns = (min(high.shape[axis], low.shape[axis]) for axis in (1, 2))
-    assert rows > 1 and columns > 1 and np.std(low) > 0.005
-    np.testing.assert_allclose(high[:, :rows, :columns], low[:, :rows, :columns], rtol=1e-3, atol=1e-4)
+    assert rows > 1 and columns > 1 and np.std(low) > 0.05
+    np.testing.assert_allclose(high[:, :rows, :columns], low[:, :rows, :columns], rtol=1e-3, atol=1e-3)
