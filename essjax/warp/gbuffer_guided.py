@@ -1,20 +1,20 @@
 """G-buffer guided warping (ExtraSS section 4.2, eq 1-3; SPEC 1).
 
 Around the reprojected position 33 pixels of the previous frame are candidates; the four whose G-buffers and positions
-fit best are blended. Selection works on packed integer keys: the bits of a non-negative float order like the float,
-so the cost with its low 6 bits replaced by the candidate's number sorts by cost, ties by number. Costs that agree to
-2^-17 count as ties. A network of minima and maxima, unrolled, finds the four best without indices, and their numbers
-leave it as one integer per pixel: one loop over pixels that keeps everything in registers. The winners' weights are
-then computed anew in full precision, which is also the only part that gradients see.
+fit best are blended. Selection works on packed keys: the cost with the low 6 of its bits replaced by the candidate's
+number sorts by cost, ties by number. Costs that agree to 2^-17 count as ties. A network of minima and maxima, unrolled,
+finds the four best without indices, and their numbers leave it as one integer per pixel: one loop over pixels that
+keeps everything in registers. The winners' weights are then computed anew in full precision, which is also the only
+part that gradients see.
 """
 
+import functools
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.cameras import pixel_positions
 from essjax.frames import GBuffers, surface_guides
 from essjax.typing import Array, Image, Motion
 from essjax.warp._batch import check_channels, over_leading_axes
@@ -22,11 +22,15 @@ from essjax.warp.sampling import gather_pixels
 
 STRIDES = (1, 3, 5, 9)
 WINNERS = 4
+_SORT_FOUR = ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))
+_SORT_BITONIC = ((0, 2), (1, 3), (0, 1), (2, 3))
 SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
 """Base colour, normal: a starting value measured on a path-traced clip; the paper gives none."""
 SIGMA_DISTANCE = 2.0
 _ID_MASK = 63  # 6 bits hold a candidate's number
-_UNUSABLE = np.int32(0x7F800000)  # bits of +inf: above the key of every finite cost
+_BORDER = 1e18  # scaled guides are below this, and so far apart (squared) is a candidate outside
+_UNUSABLE = 1e34
+_LEAST = 1e-30  # added to costs: their keys are normal numbers, which no backend flushes to zero
 _REACH = max(STRIDES)
 _FAR = 1e6  # pixels; keeps integers from overflowing
 IMPLEMENTATIONS = ("network", "reference")
@@ -43,46 +47,78 @@ def guides(gbuffers: GBuffers) -> Image:
     return jnp.concatenate(surface_guides(gbuffers), axis=-1)
 
 
+def _smaller(a: Array, b: Array) -> Array:
+    """The minimum of numbers that are not NaN: one instruction, where ``jnp.minimum`` takes care of NaN."""
+    return jnp.where(a < b, a, b)
+
+
+def _larger(a: Array, b: Array) -> Array:
+    return jnp.where(a < b, b, a)
+
+
+def _sort_pairs(keys: list[Array], *pairs: tuple[int, int]) -> list[Array]:
+    """Compare and exchange, pair by pair."""
+    keys = list(keys)
+    for i, j in pairs:
+        keys[i], keys[j] = _smaller(keys[i], keys[j]), _larger(keys[i], keys[j])
+    return keys
+
+
+def _coordinates(motion: Array) -> tuple[Array, Array]:
+    """Reprojected x and y, ``[H, W]`` each: pairs would be written out."""
+    size = motion.shape[:2]
+    x, y = (jax.lax.broadcasted_iota(jnp.float32, size, axis) + 0.5 for axis in (1, 0))
+    return x + motion[..., 0], y + motion[..., 1]
+
+
 def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> list[Array]:
-    """The key of each of the 33 candidates, ``[H, W]``: cost bits, the low 6 its number."""
+    """The key of each of the 33 candidates, ``[H, W]``: the bits of its cost, the low 6 its number, read as a float."""
     height, width, channels = guide.shape
-    # Costs are sums of squares of scaled differences. The border is +inf: a candidate there costs +inf and is never
-    # usable, without any comparison of positions. One plane per channel, as gathers of single numbers are cheapest.
+    # Costs are sums of squares of scaled differences. The border is so far from every guide that a candidate there is
+    # never usable, without any comparison of positions; so is what is not finite. One plane per channel, as gathers of
+    # single numbers are cheapest.
     scale = jnp.sqrt(0.5 * inverse)
     margin = 2 * _REACH + 1
     stride = width + 2 * margin
-    planes = [
-        jnp.pad(guide_previous[..., k] * scale[k], margin, constant_values=jnp.inf).reshape(-1) for k in range(channels)
-    ]
+
+    def scaled(image: Array, instead: float) -> list[Array]:
+        planes = [image[..., k] * scale[k] for k in range(channels)]
+        return [jnp.where(jnp.abs(plane) < _BORDER, plane, instead) for plane in planes]
+
+    planes = [jnp.pad(p, margin, constant_values=_BORDER).reshape(-1) for p in scaled(guide_previous, _BORDER)]
     planes = jax.lax.optimization_barrier(planes)
-    here = [guide[..., k] * scale[k] for k in range(channels)]
-    target = pixel_positions(height, width) + motion
+    here = scaled(guide, -_BORDER)
+    x, y = _coordinates(motion)
     # Beyond this clamp all candidates are outside already.
-    x = jnp.clip(target[..., 0], -_REACH - 0.5, width + _REACH + 0.5)
-    y = jnp.clip(target[..., 1], -_REACH - 0.5, height + _REACH + 0.5)
+    x = jnp.clip(x, -_REACH - 0.5, width + _REACH + 0.5)
+    y = jnp.clip(y, -_REACH - 0.5, height + _REACH + 0.5)
     column, row = jnp.floor(x), jnp.floor(y)
     start = (row.astype(jnp.int32) + margin) * stride + column.astype(jnp.int32) + margin
     fraction = (x - column - 0.5, y - row - 0.5)
     keys = []
     for candidate, offset in enumerate(candidate_offsets()):
         index = start + int(offset[1] * stride + offset[0])
-        differences = [here[k] - gather_pixels(planes[k], index) for k in range(channels)]
         away = [scale[channels + k] * (fraction[k] - float(offset[k])) for k in range(2)]
-        cost = jnp.asarray(sum(d * d for d in [*differences, *away]))
+        apart = [here[k] - gather_pixels(planes[k], index) for k in range(channels)]
+        cost = jnp.asarray(sum((d * d for d in [*away, *apart]), start=_LEAST))
         bits = jax.lax.bitcast_convert_type(cost, jnp.int32) & ~_ID_MASK
-        keys.append(jnp.where(cost < jnp.inf, bits, _UNUSABLE) | candidate)  # NaN is unusable too
+        keys.append(jax.lax.bitcast_convert_type(bits | candidate, jnp.float32))
     return keys
 
 
 def _best_by_network(keys: list[Array]) -> list[Array]:
-    """The four smallest, in order: each key in turn passes four minima."""
-    best: list[Array] = [jnp.full_like(keys[0], np.iinfo(np.int32).max)] * WINNERS
-    for key in keys:
-        kept = []
-        for other in best:
-            kept.append(jnp.minimum(key, other))
-            key = jnp.maximum(key, other)
-        best = kept
+    """The four smallest, in order: fours are sorted and merged, dropping the larger half."""
+    best, rest = keys[:WINNERS], keys[WINNERS:]
+    best = _sort_pairs(best, *_SORT_FOUR)
+    while rest:
+        four, rest = rest[:WINNERS], rest[WINNERS:]
+        if len(four) == WINNERS:
+            # Rising, then falling: the smaller of each pair are the four smallest, and half sorted.
+            four = _sort_pairs(four, *_SORT_FOUR)[::-1]
+            best = _sort_pairs([_smaller(a, b) for a, b in zip(best, four, strict=True)], *_SORT_BITONIC)
+        else:
+            for key in four:
+                best = _sort_pairs([*best, key], *((rank, WINNERS) for rank in range(WINNERS)))[:WINNERS]
     return best
 
 
@@ -92,22 +128,23 @@ def _best_by_sorting(keys: list[Array]) -> list[Array]:
 
 def _pack(best: list[Array]) -> Array:
     """Numbers of the winners, 6 bits each; ``_ID_MASK`` where the candidate cannot be used."""
-    numbers = [jnp.where(key < _UNUSABLE, key & _ID_MASK, _ID_MASK) for key in best]
+    bits = [jax.lax.bitcast_convert_type(key, jnp.int32) & _ID_MASK for key in best]
+    numbers = [jnp.where(key < _UNUSABLE, number, _ID_MASK) for key, number in zip(best, bits, strict=True)]
     return sum(number << (6 * rank) for rank, number in enumerate(numbers))  # type: ignore[return-value]
 
 
 def _winner(packed: Array, rank: Array | int, motion: Array) -> tuple[Array, Array, Array]:
     """Of the winner of a rank: whether it can be used, its column and its row."""
-    height, width = motion.shape[:2]
     number = (packed >> (6 * rank)) & _ID_MASK
     usable = number < _ID_MASK
     # Where nothing is usable this is the centre clamped to the image: the nearest border pixel.
     number = jnp.where(usable, number, 0)
-    target = jnp.clip(pixel_positions(height, width) + motion, -_FAR, _FAR)
-    center = jnp.floor(target).astype(jnp.int32)
-    # Coordinate by coordinate: pairs would be written out.
-    column, row = (center[..., k] + jnp.asarray(candidate_offsets()[:, k])[number] for k in range(2))
-    return usable, jnp.clip(column, 0, width - 1), jnp.clip(row, 0, height - 1)
+    place = []
+    for k, coordinate in enumerate(_coordinates(motion)):
+        center = jnp.floor(jnp.clip(coordinate, -_FAR, _FAR)).astype(jnp.int32)
+        offset = gather_pixels(jnp.asarray(candidate_offsets()[:, k]), number)
+        place.append(jnp.clip(center + offset, 0, motion.shape[1 - k] - 1))
+    return usable, place[0], place[1]
 
 
 @jax.custom_batching.sequential_vmap
@@ -122,7 +159,7 @@ def _select_alone(guide_previous: Array, guide: Array, motion: Array, inverse: A
     return jax.lax.cond(
         jnp.any(jnp.isfinite(motion)),
         lambda *arrays: _pack(_best_by_network(_keys(*arrays))),
-        lambda *arrays: _pack([jnp.full((height, width), _UNUSABLE)] * WINNERS),
+        lambda *arrays: _pack([jnp.full((height, width), jnp.inf)] * WINNERS),
         guide_previous, guide, motion, inverse,
     )  # fmt: skip
 
@@ -145,17 +182,21 @@ def _weigh(
     rank = jnp.arange(WINNERS, dtype=jnp.int32)[:, None, None]
     usable, column, row = _winner(packed, rank, motion)
     flat, pixel = guide_previous.reshape(-1), row * width + column
-    target = pixel_positions(height, width) + motion
     # Number by number: gathers of rows would be written out, these fuse.
     apart = [guide[..., k] - gather_pixels(flat, pixel * channels + k) for k in range(channels)]
-    away = [target[..., 0] - column - 0.5, target[..., 1] - row - 0.5]
-    squares = [inverse[k] * d * d for k, d in enumerate([*apart, *away])]
+    x, y = _coordinates(motion)
+    squares = [inverse[k] * d * d for k, d in enumerate([*apart, x - column - 0.5, y - row - 0.5])]
     # With all 33 unusable the first takes everything. A constant replaces the cost, so no gradient passes.
     unusable = jnp.where(rank == 0, 0.0, -jnp.inf)
     logits = jnp.where(usable, -0.5 * jnp.asarray(sum(squares)), unusable)
+    # A softmax term by term: a reduction over four planes is slow on XLA:CPU.
+    top = jax.lax.stop_gradient(functools.reduce(_larger, logits))
+    exponentials = [jnp.exp(logit - top) for logit in logits]
+    total = jnp.asarray(sum(exponentials))
+    weights = jnp.stack([exponential / total for exponential in exponentials])
     # The pixels once more, rank by rank: four stacked planes would have to be written out, these fuse.
     winners = [_winner(packed, k, motion) for k in range(WINNERS)]
-    return jax.nn.softmax(logits, axis=0), tuple(row * width + column for _, column, row in winners)
+    return jax.lax.optimization_barrier(weights), tuple(row * width + column for _, column, row in winners)
 
 
 def _warp_one(radiance: Array, *arrays: Array, implementation: str) -> Array:

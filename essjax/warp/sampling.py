@@ -67,7 +67,7 @@ def axis_taps(positions: Array, size: int, mode: str, outside: str) -> list[Tap]
 
 def gather_pixels(flat: Array, index: Array) -> Array:
     """Rows ``index`` (any shape, known to be inside) of ``flat`` ``[H * W, C]``: the fast gather."""
-    return jnp.asarray(flat).at[index].get(mode="promise_in_bounds")
+    return jnp.asarray(flat).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Array:
