@@ -28,6 +28,7 @@ class Forward(NamedTuple):
       inputs: shapes that ``apply`` takes.
       method: of ``apply``; None: the default.
       pixels: of the output.
+      output: which of several named ones is compared with those of other implementations.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Forward(NamedTuple):
     inputs: tuple
     method: str | None
     pixels: int
+    output: str | None = None
 
 
 def _shape(*size: int) -> jax.ShapeDtypeStruct:
@@ -53,24 +55,25 @@ def forwards(width: int, height: int) -> list[Forward]:
     fasset = (*(_shape(*low, n) for n in (3, 1, 7, 24)), _shape(1, 2))
     features = _shape(*low, 4), _shape(*high, FEATURES), _shape(PREVIOUS, *high, FEATURES)
     frnet = _shape(2, *half, 3), _shape(*half, 1)
+    ifrnet = _shape(2, *low, 3), _shape(2, 1, 2)
     extranet = input_shapes(1, height=native["height"], width=native["width"])
     extrassnet = networks.extrassnet()
 
-    def forward(name, network, shapes, pixels, *, method=None, given=None):
-        return Forward(name, network, shapes, shapes if given is None else given, method, pixels)
+    def forward(name, network, shapes, pixels, *, method=None, given=None, output=None):
+        return Forward(name, network, shapes, shapes if given is None else given, method, pixels, output)
 
     sizes = width * height, 4 * width * height
     to_high = f"{names['low']} to {names['high']}"
     return [
         forward(f"ExtraSSNet SS, {to_high}", extrassnet, extrass, sizes[1], method="render", given=extrass[:1]),
         forward(f"ExtraSSNet ESS, {to_high}", extrassnet, extrass, sizes[1], method="extrapolate", given=extrass[1:]),
-        forward(f"FRNet, {half[2]}x{half[1]}", networks.frnet(), frnet, sizes[0]),
+        forward(f"FRNet, {half[2]}x{half[1]}", networks.frnet(), frnet, sizes[0], output="flow"),
         forward(
             f"ExtraNet, {native['width']}x{native['height']}", networks.extranet(), extranet, extranet[1].size
         ),
         forward(f"DLCTUS, {names['high']}", networks.dlctus_network(), (_shape(*high, 8),), sizes[1]),
         forward(f"FASSET, {to_high}", networks.fasset(2), fasset, sizes[1], method="render"),
-        forward(f"IFRNet, {names['low']}", networks.ifrnet(), (_shape(2, *low, 3), _shape(2, 1, 2)), sizes[0]),
+        forward(f"IFRNet, {names['low']}", networks.ifrnet(), ifrnet, sizes[0], output="image"),
         forward(
             f"NSRR, {names['high']}", networks.nsrr(), features, sizes[1], method="reconstruct", given=features[1:]
         ),
@@ -78,14 +81,15 @@ def forwards(width: int, height: int) -> list[Forward]:
 
 
 def case(forward: Forward, dtype: str) -> Case:
-    """The forward pass on noise, products in ``dtype``."""
+    """The forward pass on noise, products in ``dtype``; what is compared with others is the first of its outputs."""
     variables = jax.jit(lambda key: forward.network.init(key, *forward.init))(jax.random.key(0))
     noise = np.random.default_rng(0)  # heads start at zero, statistics at 0 and 1: a wrong peer would not be found out
     variables = jax.tree.map(lambda x: x + 0.02 * noise.standard_normal(x.shape, np.float32), variables)
 
     def apply(variables, *arguments):
         with compute_dtype(dtype):
-            return forward.network.apply(variables, *arguments, method=forward.method)[0]
+            made = forward.network.apply(variables, *arguments, method=forward.method)[0]
+        return made if forward.output is None else (made[forward.output], made)
 
     arguments = (variables, *inputs.random_like(forward.inputs))
     return Case(forward.name, apply, arguments, work={"pixels": forward.pixels})

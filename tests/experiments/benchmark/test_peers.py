@@ -9,6 +9,7 @@ pytest.importorskip("torch")
 from experiments.benchmark import peers  # noqa: E402
 from experiments.benchmark.suites import networks, warp  # noqa: E402
 
+NETWORKS = ["ExtraSSNet SS", "ExtraSSNet ESS", "ExtraNet", "DLCTUS", "FRNet", "IFRNet", "NSRR", "FASSET"]
 WARPS = {case.name.split(",")[0]: case for case in warp.cases(45, 38)}
 
 
@@ -26,7 +27,7 @@ def test_warps(name):
     assert _difference(WARPS[name]) < peers.TOLERANCE
 
 
-@pytest.mark.parametrize("name", ["ExtraSSNet SS", "ExtraSSNet ESS", "ExtraNet", "DLCTUS"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_networks(name):
     forward = next(f for f in networks.forwards(45, 38) if f.name.split(",")[0] == name)
     assert _difference(networks.case(forward, "float32")) < peers.TOLERANCE
