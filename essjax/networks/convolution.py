@@ -1,9 +1,9 @@
 """Convolutions whose gradients stay fast inside ``lax.scan`` on CPUs.
 
 XLA:CPU lays out the gradients of a convolution in a loop such that they miss its fast routine and run about 20 times
-slower (docs/adr/0006-scan-friendly-convolution.md). Written out as plain NHWC convolutions they do not. A strided one
-becomes a stride-1 convolution of blocks first, a depthwise one a sum of shifted products. On other backends the
-ordinary convolution is used.
+slower (docs/adr/0006-scan-friendly-convolution.md). Written out as plain NHWC convolutions they do not. The gradient of
+a strided one is that of a stride-1 convolution of blocks, a depthwise one is a sum of shifted products. On other
+backends the ordinary convolution is used.
 """
 
 from functools import partial
@@ -62,6 +62,23 @@ def _by_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -
     return _convolve(x, kernel, tuple((low, n - 1 - low) for low, n in zip(lows, blocks, strict=True)))
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _strided(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -> jax.Array:
+    """The ordinary one, which is faster than blocks; only its gradient is that of ``_by_blocks``."""
+    return lax.conv_general_dilated(x, kernel, (stride, stride), padding, dimension_numbers=_NHWC)
+
+
+def _strided_forward(x, kernel, stride, padding):
+    return _strided(x, kernel, stride, padding), (x, kernel)
+
+
+def _strided_backward(stride, padding, residuals, gradient):
+    return jax.vjp(lambda x, kernel: _by_blocks(x, kernel, stride, padding), *residuals)[1](gradient)
+
+
+_strided.defvjp(_strided_forward, _strided_backward)
+
+
 def _shifted(x: jax.Array, kernel: jax.Array, padding: Padding) -> list[list[jax.Array]]:
     """What each place of the kernel sees, ``[kh][kw]`` arrays of the output's size."""
     padded = jnp.pad(x, [(0, 0), *padding, (0, 0)])
@@ -114,7 +131,7 @@ def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation
         if all(n - strides[0] <= low + high < n and low < n for n, (low, high) in zip(rhs.shape, pairs, strict=False)):
             if depthwise:
                 return _depthwise(lhs, rhs, pairs)
-            return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _by_blocks(lhs, rhs, strides[0], pairs)
+            return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _strided(lhs, rhs, strides[0], pairs)
     return lax.conv_general_dilated(
         lhs, rhs, window_strides, padding, lhs_dilation=lhs_dilation, rhs_dilation=rhs_dilation, **options
     )

@@ -19,7 +19,9 @@ from essjax.warp import backward_warp
 
 LEVELS = 3
 OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-1.0, 1.5, 0.5)]), axis=-1).reshape(-1, 2).astype(np.float32)
-"""Flows that ``matched_flow`` tries, (x, y) half-size pixels per rendered frame."""
+"""Flows that ``matched_flow`` tries, (x, y) half-size pixels per rendered frame; half pixels."""
+REACH = 3
+"""Pixels that the older frame is read away at most: three times the largest of them."""
 PATCH = 7
 """Side of the squares whose match is judged, half-size pixels."""
 TEMPERATURE = 0.003
@@ -41,26 +43,49 @@ def matched_flow(warped: Image, roughness: Plane) -> Image:
     Returns:
       Flow to the newest frame, ``[..., h, w, 2]`` pixels of this size; no gradient.
     """
-    newest, older = jax.lax.stop_gradient(warped)
+    size = warped.shape[-3:-1]
+    newest, older = (_halfway(image) for image in jax.lax.stop_gradient(warped))
     price = COST_PER_PIXEL * (1.0 + COST_OF_ROUGHNESS * jnp.maximum(roughness - SMOOTH, 0.0))[..., 0]
+    means = []
+    for x, y in OFFSETS.tolist():
+        difference = jnp.abs(_read(newest, x, y, size) - _read(older, 3.0 * x, 3.0 * y, size))
+        means.append(jnp.asarray(sum_channels(difference)[..., 0]) / difference.shape[-1])
+    lengths = np.linalg.norm(OFFSETS, axis=-1).reshape(-1, *(1,) * price.ndim)
+    costs = _box(jnp.stack(means)) + price * lengths
+    # A softmax, term by term: reductions over an axis that is not the last are slow on XLA:CPU.
+    weights = jnp.exp((jnp.min(costs, axis=0) - costs) / TEMPERATURE)
+    total, *flow = (
+        sum(factor * weight for factor, weight in zip(factors.tolist(), weights, strict=True))
+        for factors in (np.ones(len(OFFSETS)), *OFFSETS.T)
+    )
+    return jax.lax.stop_gradient(jnp.stack([component / total for component in flow], axis=-1))
 
-    def cost(offset: jax.Array) -> jax.Array:
-        flow = jnp.broadcast_to(offset, (*newest.shape[:-1], 2))
-        difference = jnp.abs(backward_warp(newest, flow) - backward_warp(older, 3.0 * flow))
-        mean = jnp.asarray(sum_channels(difference)[..., 0]) / difference.shape[-1]
-        return _box(mean) + price * jnp.linalg.norm(offset)
 
-    costs = jax.lax.map(cost, jnp.asarray(OFFSETS, newest.dtype))
-    weights = jax.nn.softmax(-costs / TEMPERATURE, axis=0)
-    return jax.lax.stop_gradient(jnp.tensordot(jnp.moveaxis(weights, 0, -1), jnp.asarray(OFFSETS), axes=1))
+def _halfway(image: Image) -> list[list[jax.Array]]:
+    """The padded image, borders replicated, at every half pixel: ``[k][l]`` is k / 2 down and l / 2 right of it."""
+    lead = [(0, 0)] * (image.ndim - 3)
+    padded = jnp.pad(image, [*lead, (REACH, REACH + 1), (REACH, REACH + 1), (0, 0)], mode="edge")
+    whole, down = padded[..., :-1, :, :], 0.5 * (padded[..., :-1, :, :] + padded[..., 1:, :, :])
+    halves = [[rows[..., :-1, :], 0.5 * (rows[..., :-1, :] + rows[..., 1:, :])] for rows in (whole, down)]
+    return jax.lax.optimization_barrier(halves)  # else every reader computes its means again
+
+
+def _read(halves: list[list[jax.Array]], x: float, y: float, size: tuple[int, int]) -> jax.Array:
+    """Of ``_halfway``, every pixel at a constant offset in half pixels, ``REACH`` at most."""
+    down, right = int(2 * (y + REACH)), int(2 * (x + REACH))
+    rows, columns = slice(down // 2, down // 2 + size[0]), slice(right // 2, right // 2 + size[1])
+    return halves[down % 2][right % 2][..., rows, columns, :]
 
 
 def _box(values: jax.Array) -> jax.Array:
     """Mean over ``PATCH`` x ``PATCH`` of ``[..., h, w]``, borders replicated."""
-    lead, reach = values.ndim - 2, PATCH // 2
-    padded = jnp.pad(values, [(0, 0)] * lead + [(reach, reach)] * 2, mode="edge")
-    window = (1,) * lead + (PATCH, PATCH)
-    return jax.lax.reduce_window(padded, 0.0, jax.lax.add, window, (1,) * padded.ndim, "VALID") / PATCH**2
+    reach = PATCH // 2
+    values = jnp.pad(values, [(0, 0)] * (values.ndim - 2) + [(reach, reach)] * 2, mode="edge")
+    for axis in (-2, -1):
+        size = values.shape[axis] - PATCH + 1
+        parts = [jax.lax.slice_in_dim(values, k, k + size, axis=axis % values.ndim) for k in range(PATCH)]
+        values = sum(parts[1:], start=parts[0])
+    return values / PATCH**2
 
 
 class FRNet(nn.Module):

@@ -12,7 +12,8 @@ from essjax.frames import select_time
 from essjax.methods import extrass
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, pad_to_multiple
-from essjax.networks.frnet import matched_flow
+from essjax.networks.frnet import OFFSETS, _halfway, _read, matched_flow
+from essjax.warp import backward_warp
 from tests.helpers import make_frames, random_image
 
 
@@ -108,6 +109,14 @@ def test_matching_finds_shading_that_moves_evenly(flow):
     found = np.asarray(jax.jit(matched_flow)(warped, roughness))
     np.testing.assert_allclose(found[8:16, 8:11], np.broadcast_to(flow, (8, 3, 2)), atol=0.02)
     np.testing.assert_allclose(found[:, 12:], 0.0, atol=1e-4)
+
+
+def test_matching_reads_what_a_warp_reads():
+    """Every offset, tripled too: slices of the half-pixel images against the bilinear warp."""
+    image = random_image(6, 7, 9, 3)
+    for x, y in np.concatenate([OFFSETS, 3 * OFFSETS]).tolist():
+        warped = backward_warp(image, jnp.full((7, 9, 2), jnp.array([x, y])))
+        np.testing.assert_allclose(_read(_halfway(image), x, y, (7, 9)), warped, atol=1e-5)
 
 
 def test_matching_of_equal_frames_finds_no_motion():
