@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
 from essjax.typing import Array, Image, Mask, Motion, Positions
-from essjax.warp._batch import check_channels, over_leading_axes
+from essjax.warp._batch import check_channels
 
 OUTSIDE = ("border", "zeros")
 CUBIC_PARAMETER = {"bicubic": -0.5, "bicubic-0.75": -0.75}
@@ -71,42 +71,48 @@ def gather_pixels(flat: Array, index: Array) -> Array:
 
 
 def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Array:
-    """One gather per tap: they fuse with the arithmetic."""
-    height, width, channels = image.shape
-    flat = image.reshape(height * width, channels)
+    """Read ``[B, H, W, C]`` at ``[N, h, w, 2]``, B = N or 1. One gather per tap: they fuse with the arithmetic."""
+    batch, height, width, channels = image.shape
+    # Under vmap gathers do not fuse on XLA:CPU: the images become one, and an index says which of them, too.
+    flat, base = image.reshape(-1, channels), _image_numbers(batch) * (height * width)
     columns = axis_taps(positions[..., 0], width, mode, outside)
     rows = axis_taps(positions[..., 1], height, mode, outside)
     if mode == "nearest":  # no arithmetic: integers stay exact and +inf stays +inf
-        value = gather_pixels(flat, rows[0].index * width + columns[0].index)
+        value = gather_pixels(flat, base + rows[0].index * width + columns[0].index)
         return jnp.where((rows[0].weight * columns[0].weight)[..., None] > 0, value, jnp.zeros_like(value))
     total = jnp.zeros((), jnp.float32)
     for row in rows:
         for column in columns:
-            value = gather_pixels(flat, row.index * width + column.index).astype(jnp.float32)
+            value = gather_pixels(flat, base + row.index * width + column.index).astype(jnp.float32)
             total = total + value * (row.weight * column.weight)[..., None]
     return total.astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.floating) else total
 
 
-_WINDOW = jax.lax.GatherDimensionNumbers(offset_dims=(2, 3, 4), collapsed_slice_dims=(), start_index_map=(0, 1))
+def _image_numbers(batch: int) -> Array:
+    return jnp.arange(batch, dtype=jnp.int32)[:, None, None]
+
+
+_WINDOW = jax.lax.GatherDimensionNumbers(offset_dims=(3, 4, 5), collapsed_slice_dims=(0,), start_index_map=(0, 1, 2))
 
 
 def _sample_windows(image: Array, positions: Array, mode: str, outside: str) -> Array:
     """The same by one gather of a 4x4 window per position: slower itself, but its transpose is a single scatter."""
-    height, width, channels = image.shape
+    batch, height, width, channels = image.shape
     margin = 5  # positions are clamped to 3 pixels outside: every window lies in the padded image
-    pad = ((margin, margin), (margin, margin), (0, 0))
+    pad = ((0, 0), (margin, margin), (margin, margin), (0, 0))
     padded = jnp.pad(image, pad, mode="edge") if outside == "border" else jnp.pad(image, pad)
     first_column, columns = _axis_window(positions[..., 0], width, mode)
     first_row, rows = _axis_window(positions[..., 1], height, mode)
-    start = jnp.stack([first_row, first_column], axis=-1) + margin
+    which = jnp.broadcast_to(_image_numbers(batch), first_row.shape)
+    start = jnp.stack([which, first_row + margin, first_column + margin], axis=-1)
     inside = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    window = jax.lax.gather(padded, start, _WINDOW, (4, 4, channels), mode=inside).astype(jnp.float32)
+    window = jax.lax.gather(padded, start, _WINDOW, (1, 4, 4, channels), mode=inside).astype(jnp.float32)
     total = jnp.sum(window * (rows[..., :, None] * columns[..., None, :])[..., None], axis=(-3, -2))
     return total.astype(image.dtype)
 
 
 def _axis_window(positions: Array, size: int, mode: str) -> tuple[Array, Array]:
-    """First pixel ``[h, w]`` (may be outside) and the four cubic weights ``[h, w, 4]`` along one axis."""
+    """First pixel ``[..., h, w]`` (may be outside) and the four cubic weights ``[..., h, w, 4]`` along one axis."""
     x = jnp.clip(positions.astype(jnp.float32), -3.0, size + 3.0) - 0.5
     weights = cubic_weights(x - jnp.floor(x), CUBIC_PARAMETER[mode])
     return jnp.floor(x).astype(jnp.int32) - 1, jnp.stack(weights, axis=-1)
@@ -132,11 +138,6 @@ def _cubic_backward(mode, outside, residuals, gradient):
 _sample_cubic.defvjp(_cubic_forward, _cubic_backward)
 
 
-def _sample_one(image: Array, positions: Array, mode: str, outside: str) -> Array:
-    differentiable = mode in CUBIC_PARAMETER and jnp.issubdtype(image.dtype, jnp.floating)
-    return (_sample_cubic if differentiable else _sample_taps)(image, positions, mode, outside)
-
-
 def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outside: str = "border") -> Image:
     """Read ``image`` at ``positions``.
 
@@ -160,7 +161,13 @@ def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outsid
     check_mode(mode, outside)
     check_channels("image", image, None)
     check_channels("positions", positions, 2)
-    return over_leading_axes(lambda i, p: _sample_one(i, p, mode, outside), (3, 3), image, positions)
+    leading = jnp.broadcast_shapes(image.shape[:-3], positions.shape[:-3])
+    if image.ndim > 3:  # else it is shared, not copied
+        image, positions = (jnp.broadcast_to(x, (*leading, *x.shape[-3:])) for x in (image, positions))
+    differentiable = mode in CUBIC_PARAMETER and jnp.issubdtype(image.dtype, jnp.floating)
+    kernel = _sample_cubic if differentiable else _sample_taps
+    result = kernel(*(x.reshape(-1, *x.shape[-3:]) for x in (image, positions)), mode, outside)
+    return result.reshape(*leading, *result.shape[1:])
 
 
 def inside_mask(motion: Motion) -> Mask:

@@ -9,31 +9,32 @@ from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.sampling import gather_pixels
 
 _WINDOW = jax.lax.ScatterDimensionNumbers(
-    update_window_dims=(2, 3, 4), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
+    update_window_dims=(3, 4, 5), inserted_window_dims=(0,), scatter_dims_to_operand_dims=(0, 1, 2)
 )
 _MARGIN = 2  # positions are clamped to 1 pixel outside: every 2x2 window lies in the padded image
 
 
-def _splat_one(image: Array, motion: Array) -> Array:
-    # One scatter of 2x2 windows instead of four of pixels: a quarter less time on XLA:CPU.
-    height, width, channels = image.shape
+def _splat_windows(image: Array, motion: Array) -> Array:
+    """``[B, H, W, C]`` and ``[B, H, W, 2]``. One scatter of 2x2 windows is faster than four of pixels."""
+    batch, height, width, channels = image.shape
     target = pixel_positions(height, width) + motion
     first_column, columns = _axis_pair(target[..., 0], width)
     first_row, rows = _axis_pair(target[..., 1], height)
-    start = jnp.stack([first_row, first_column], axis=-1) + _MARGIN
+    which = jnp.broadcast_to(jnp.arange(batch, dtype=jnp.int32)[:, None, None], first_row.shape)
+    start = jnp.stack([which, first_row + _MARGIN, first_column + _MARGIN], axis=-1)
     weights = rows[..., :, None] * columns[..., None, :]
     total = jax.lax.scatter_add(
-        jnp.zeros((height + 2 * _MARGIN, width + 2 * _MARGIN, channels), jnp.float32),
+        jnp.zeros((batch, height + 2 * _MARGIN, width + 2 * _MARGIN, channels), jnp.float32),
         start,
         weights[..., None] * image.astype(jnp.float32)[..., None, None, :],
         _WINDOW,
         mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
-    return total[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].astype(image.dtype)
+    return total[:, _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].astype(image.dtype)
 
 
 def _axis_pair(positions: Array, size: int) -> tuple[Array, Array]:
-    """First of the two pixels ``[H, W]`` around a position along one axis, and their bilinear weights ``[H, W, 2]``."""
+    """First of the two pixels ``[B, H, W]`` around a position on one axis, and their weights ``[B, H, W, 2]``."""
     x = jnp.clip(positions, -1.0, size + 1.0) - 0.5
     first = jnp.floor(x)
     return first.astype(jnp.int32), jnp.stack([1.0 - (x - first), x - first], axis=-1)
@@ -54,7 +55,10 @@ def splat(image: Image, motion: Motion) -> Image:
     """
     check_channels("image", image, None)
     check_channels("motion", motion, 2, image.shape[-3:-1])
-    return over_leading_axes(_splat_one, (3, 3), image, motion)
+    leading = jnp.broadcast_shapes(image.shape[:-3], motion.shape[:-3])
+    image, motion = (jnp.broadcast_to(x, (*leading, *x.shape[-3:])).reshape(-1, *x.shape[-3:]) for x in (image, motion))
+    result = _splat_windows(image, motion)
+    return result.reshape(*leading, *result.shape[1:])
 
 
 def _splat_nearest_one(image: Array, depth: Array, motion: Array) -> tuple[Array, Array]:
