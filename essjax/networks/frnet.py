@@ -43,7 +43,7 @@ def matched_flow(warped: Image, roughness: Plane) -> Image:
     Returns:
       Flow to the newest frame, ``[..., h, w, 2]`` pixels of this size; no gradient.
     """
-    size = warped.shape[-3:-1]
+    size = (warped.shape[-3], warped.shape[-2])
     newest, older = (_halfway(image) for image in jax.lax.stop_gradient(warped))
     price = COST_PER_PIXEL * (1.0 + COST_OF_ROUGHNESS * jnp.maximum(roughness - SMOOTH, 0.0))[..., 0]
     means = []

@@ -5,6 +5,8 @@ Conventions (those of ``grid_sample`` with ``align_corners=False``, in pixels): 
 (``"zeros"``); both hold per tap, so a bilinear read half a pixel outside blends the border pixel with 0.
 """
 
+import math
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -70,43 +72,61 @@ def gather_pixels(flat: Array, index: Array) -> Array:
     return jnp.asarray(flat).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
+def merge_leading_axes(image: Array) -> Array:
+    """``[..., H, W, C]`` as ``[B, H, W, C]``, or as ``[H, W, C]`` where that is one image."""
+    batch = math.prod(image.shape[:-3])
+    return image.reshape(*([batch] if batch != 1 else []), *image.shape[-3:])
+
+
+def stack_images(image: Array) -> tuple[Array, Array | int]:
+    """Images ``[B, H, W, C]`` below each other, ``[B * H, W, C]``, and the first row of each, ``[B, 1, 1]``.
+
+    Under vmap gathers and scatters do not fuse on XLA:CPU; of one high image they do. One image without a leading axis
+    passes unchanged and begins at row 0.
+    """
+    if image.ndim == 3:
+        return image, 0
+    batch, height, *rest = image.shape
+    return image.reshape(batch * height, *rest), (jnp.arange(batch, dtype=jnp.int32) * height)[:, None, None]
+
+
 def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Array:
-    """Read ``[B, H, W, C]`` at ``[N, h, w, 2]``, B = N or 1. One gather per tap: they fuse with the arithmetic."""
-    batch, height, width, channels = image.shape
-    # Under vmap gathers do not fuse on XLA:CPU: the images become one, and an index says which of them, too.
-    flat, base = image.reshape(-1, channels), _image_numbers(batch) * (height * width)
+    """One gather per tap: they fuse with the arithmetic. Arguments as ``_sample_cubic``."""
+    height, width, channels = image.shape[-3:]
+    stacked, first = stack_images(image)
+    flat = stacked.reshape(-1, channels)
     columns = axis_taps(positions[..., 0], width, mode, outside)
     rows = axis_taps(positions[..., 1], height, mode, outside)
     if mode == "nearest":  # no arithmetic: integers stay exact and +inf stays +inf
-        value = gather_pixels(flat, base + rows[0].index * width + columns[0].index)
+        value = gather_pixels(flat, (first + rows[0].index) * width + columns[0].index)
         return jnp.where((rows[0].weight * columns[0].weight)[..., None] > 0, value, jnp.zeros_like(value))
     total = jnp.zeros((), jnp.float32)
     for row in rows:
         for column in columns:
-            value = gather_pixels(flat, base + row.index * width + column.index).astype(jnp.float32)
+            value = gather_pixels(flat, (first + row.index) * width + column.index).astype(jnp.float32)
             total = total + value * (row.weight * column.weight)[..., None]
     return total.astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.floating) else total
 
 
-def _image_numbers(batch: int) -> Array:
-    return jnp.arange(batch, dtype=jnp.int32)[:, None, None]
-
-
-_WINDOW = jax.lax.GatherDimensionNumbers(offset_dims=(3, 4, 5), collapsed_slice_dims=(0,), start_index_map=(0, 1, 2))
-
-
 def _sample_windows(image: Array, positions: Array, mode: str, outside: str) -> Array:
     """The same by one gather of a 4x4 window per position: slower itself, but its transpose is a single scatter."""
-    batch, height, width, channels = image.shape
+    height, width, channels = image.shape[-3:]
     margin = 5  # positions are clamped to 3 pixels outside: every window lies in the padded image
-    pad = ((0, 0), (margin, margin), (margin, margin), (0, 0))
-    padded = jnp.pad(image, pad, mode="edge") if outside == "border" else jnp.pad(image, pad)
+    pad = [(0, 0)] * (image.ndim - 3) + [(margin, margin), (margin, margin), (0, 0)]
+    padded, first = stack_images(jnp.pad(image, pad, mode="edge") if outside == "border" else jnp.pad(image, pad))
     first_column, columns = _axis_window(positions[..., 0], width, mode)
     first_row, rows = _axis_window(positions[..., 1], height, mode)
-    which = jnp.broadcast_to(_image_numbers(batch), first_row.shape)
-    start = jnp.stack([which, first_row + margin, first_column + margin], axis=-1)
-    inside = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    window = jax.lax.gather(padded, start, _WINDOW, (1, 4, 4, channels), mode=inside).astype(jnp.float32)
+    start = jnp.stack([first + first_row, first_column], axis=-1) + margin
+    lead = start.ndim - 1
+    window = jax.lax.gather(
+        padded,
+        start,
+        jax.lax.GatherDimensionNumbers(
+            offset_dims=(lead, lead + 1, lead + 2), collapsed_slice_dims=(), start_index_map=(0, 1)
+        ),
+        (4, 4, channels),
+        mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS,
+    ).astype(jnp.float32)
     total = jnp.sum(window * (rows[..., :, None] * columns[..., None, :])[..., None], axis=(-3, -2))
     return total.astype(image.dtype)
 
@@ -120,7 +140,10 @@ def _axis_window(positions: Array, size: int, mode: str) -> tuple[Array, Array]:
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def _sample_cubic(image: Array, positions: Array, mode: str, outside: str) -> Array:
-    """Bicubic reads whose gradient to the image is one scatter, not 16 (4x faster, and to compile as well)."""
+    """Bicubic reads whose gradient to the image is one scatter, not 16 (4x faster, and to compile as well).
+
+    The image is ``[B, H, W, C]`` with positions ``[B, h, w, 2]``, or ``[H, W, C]`` with positions ``[..., h, w, 2]``.
+    """
     return _sample_taps(image, positions, mode, outside)
 
 
@@ -162,12 +185,13 @@ def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outsid
     check_channels("image", image, None)
     check_channels("positions", positions, 2)
     leading = jnp.broadcast_shapes(image.shape[:-3], positions.shape[:-3])
-    if image.ndim > 3:  # else it is shared, not copied
+    if math.prod(image.shape[:-3]) != 1:  # else it is shared, not copied
         image, positions = (jnp.broadcast_to(x, (*leading, *x.shape[-3:])) for x in (image, positions))
+    image, positions = merge_leading_axes(image), merge_leading_axes(positions)
     differentiable = mode in CUBIC_PARAMETER and jnp.issubdtype(image.dtype, jnp.floating)
-    kernel = _sample_cubic if differentiable else _sample_taps
-    result = kernel(*(x.reshape(-1, *x.shape[-3:]) for x in (image, positions)), mode, outside)
-    return result.reshape(*leading, *result.shape[1:])
+    kernel: Callable[..., Array] = _sample_cubic if differentiable else _sample_taps
+    result = kernel(image, positions, mode, outside)
+    return result.reshape(*leading, *result.shape[-3:])
 
 
 def inside_mask(motion: Motion) -> Mask:

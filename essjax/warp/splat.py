@@ -6,35 +6,35 @@ import jax.numpy as jnp
 from essjax.cameras import pixel_positions
 from essjax.typing import Array, Image, Mask, Motion, Plane
 from essjax.warp._batch import check_channels, over_leading_axes
-from essjax.warp.sampling import gather_pixels
+from essjax.warp.sampling import gather_pixels, merge_leading_axes, stack_images
 
-_WINDOW = jax.lax.ScatterDimensionNumbers(
-    update_window_dims=(3, 4, 5), inserted_window_dims=(0,), scatter_dims_to_operand_dims=(0, 1, 2)
-)
 _MARGIN = 2  # positions are clamped to 1 pixel outside: every 2x2 window lies in the padded image
 
 
 def _splat_windows(image: Array, motion: Array) -> Array:
-    """``[B, H, W, C]`` and ``[B, H, W, 2]``. One scatter of 2x2 windows is faster than four of pixels."""
-    batch, height, width, channels = image.shape
+    """``[B, H, W, C]`` and ``[B, H, W, 2]``, or one image. One scatter of 2x2 windows is faster than four of pixels."""
+    *batch, height, width, channels = image.shape
     target = pixel_positions(height, width) + motion
     first_column, columns = _axis_pair(target[..., 0], width)
     first_row, rows = _axis_pair(target[..., 1], height)
-    which = jnp.broadcast_to(jnp.arange(batch, dtype=jnp.int32)[:, None, None], first_row.shape)
-    start = jnp.stack([which, first_row + _MARGIN, first_column + _MARGIN], axis=-1)
+    size = (*batch, height + 2 * _MARGIN, width + 2 * _MARGIN, channels)
+    total, first = stack_images(jnp.zeros(size, jnp.float32))
     weights = rows[..., :, None] * columns[..., None, :]
+    lead = first_row.ndim
     total = jax.lax.scatter_add(
-        jnp.zeros((batch, height + 2 * _MARGIN, width + 2 * _MARGIN, channels), jnp.float32),
-        start,
+        total,
+        jnp.stack([first + first_row, first_column], axis=-1) + _MARGIN,
         weights[..., None] * image.astype(jnp.float32)[..., None, None, :],
-        _WINDOW,
+        jax.lax.ScatterDimensionNumbers(
+            update_window_dims=(lead, lead + 1, lead + 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
+        ),
         mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
-    return total[:, _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].astype(image.dtype)
+    return total.reshape(size)[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN, :].astype(image.dtype)
 
 
 def _axis_pair(positions: Array, size: int) -> tuple[Array, Array]:
-    """First of the two pixels ``[B, H, W]`` around a position on one axis, and their weights ``[B, H, W, 2]``."""
+    """First of the two pixels ``[..., H, W]`` around a position on one axis, their weights ``[..., H, W, 2]``."""
     x = jnp.clip(positions, -1.0, size + 1.0) - 0.5
     first = jnp.floor(x)
     return first.astype(jnp.int32), jnp.stack([1.0 - (x - first), x - first], axis=-1)
@@ -56,9 +56,10 @@ def splat(image: Image, motion: Motion) -> Image:
     check_channels("image", image, None)
     check_channels("motion", motion, 2, image.shape[-3:-1])
     leading = jnp.broadcast_shapes(image.shape[:-3], motion.shape[:-3])
-    image, motion = (jnp.broadcast_to(x, (*leading, *x.shape[-3:])).reshape(-1, *x.shape[-3:]) for x in (image, motion))
-    result = _splat_windows(image, motion)
-    return result.reshape(*leading, *result.shape[1:])
+    result = _splat_windows(
+        *(merge_leading_axes(jnp.broadcast_to(x, (*leading, *x.shape[-3:]))) for x in (image, motion))
+    )
+    return result.reshape(*leading, *result.shape[-3:])
 
 
 def _splat_nearest_one(image: Array, depth: Array, motion: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from essjax.cameras import pixel_positions
 from essjax.warp import backward_warp, inside_mask, sample
 from essjax.warp.sampling import MODES, OUTSIDE
 
@@ -172,6 +173,27 @@ def test_batch_elements_are_independent(mode):
     for j in range(3):
         for i in range(2):
             np.testing.assert_allclose(got[j, i], warp(images[j, i], motions[i], mode=mode), atol=1e-6)
+
+
+@pytest.mark.parametrize(("mode", "outside"), [("bilinear", "border"), ("bicubic", "border"), ("bicubic", "zeros")])
+def test_gradients_of_a_batch_are_those_of_its_elements(mode, outside):
+    images, motions = (np.stack([make(i) for i in range(3)]) for make in (image_of, motion_of))
+    target = image_of(9)  # asymmetric
+    gradient = jax.jit(jax.grad(lambda i, m: jnp.sum(backward_warp(i, m, mode=mode, outside=outside) * target), (0, 1)))
+    together = gradient(images, motions)
+    for i in range(3):
+        for ours, alone in zip(together, gradient(images[i], motions[i]), strict=True):
+            np.testing.assert_allclose(ours[i], alone, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+def test_one_image_is_shared_by_many_positions(mode):
+    image, motions = image_of(0), np.stack([[motion_of(i) for i in range(2)]])
+    expected = [warp(image, motion, mode=mode) for motion in motions[0]]
+    for shared in (image, image[None], image[None, None]):
+        got = read(shared, pixel_positions(H, W) + motions, mode=mode)
+        assert got.shape == (1, 2, H, W, image.shape[-1])
+        np.testing.assert_allclose(got[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(("mode", "outside"), [("nearest", "zeros"), ("bilinear", "border"), ("bicubic", "zeros")])

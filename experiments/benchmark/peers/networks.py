@@ -241,7 +241,7 @@ def ifrnet(p: Weights) -> Callable:
         x = x.reshape(batch, 2, 2, channels // 4, rows, columns).permute(0, 3, 4, 1, 5, 2)
         return x.reshape(batch, channels // 4, 2 * rows, 2 * columns)
 
-    def decoder(x, p, side):
+    def decoder(x, p, side) -> tuple[torch.Tensor, Any]:
         x = interlaced(prelu(conv(x, p["Conv_0"]), p["PReLU_0"]), p["Interlaced_0"], side)
         return shuffled(conv(x, p["Conv_1"])), shuffled(conv(x, p["Conv_2"])) if "Conv_2" in p else None
 
