@@ -15,7 +15,7 @@ from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.evaluate import Clip, Runner
 from experiments.tuning import Setting, setting_variables, tune
-from experiments.variants import BASELINES, VARIANTS, compared, stages_of, trained_as
+from experiments.variants import VARIANTS, compared, stages_of, trained_as
 
 
 class Trained(NamedTuple):
@@ -133,14 +133,23 @@ def unequal(info: MethodInfo, scale: int) -> str:
 _TIMES = {2: "twice", 4: "four times", 8: "eight times"}
 
 
-def _left_out(sequence: FrameSequence, config: Config) -> list[str]:
-    """One remark per baseline that does not fit the data."""
-    reasons = {row: unfit(VARIANTS[row].method(config), sequence) for row in BASELINES}
-    return [f"No {row} row: {reason}." for row, reason in reasons.items() if reason]
+def _left_out(names: Sequence[str], sequence: FrameSequence, config: Config) -> list[str]:
+    """One remark per variant or baseline that does not fit the data."""
+    remarks = []
+    for row in compared(names):
+        method = VARIANTS[row].method(config)
+        reason = unfit(method, sequence) if row not in names else ""
+        if method.info.native and sequence.native is None:
+            reason = "this dataset has no colour at native resolution"
+        if reason:
+            remarks.append(f"No {row} row: {reason}.")
+    return remarks
 
 
-def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], config: Config) -> list[str]:
-    """What the reader of the table must know."""
+def notes(
+    names: Sequence[str], dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], config: Config
+) -> list[str]:
+    """What the reader of the table with the variants ``names`` must know."""
     share = sum(clip.holes[clip.scored].mean() for clip in clips) / len(clips)
     exact = "exact, from the renderer" if clips[0].exact_holes else "estimated from the G-buffers"
     scored = sum(len(clip.scored) for clip in clips)
@@ -153,9 +162,7 @@ def notes(dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], con
     for row, setting in settings.items():
         chosen = f"alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}"
         remarks.append(f"{row}: {chosen}, the best on the validation frames ({setting.psnr:.2f} dB there).")
-    remarks += _left_out(clips[0].sequence, config)
-    if clips[0].sequence.native is None:
-        remarks.append("No taa row: this dataset has no colour at native resolution.")
+    remarks += _left_out(names, clips[0].sequence, config)
     if not clips[0].exact_holes:
         remarks.append(_foreground_note())
     return remarks

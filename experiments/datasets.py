@@ -9,7 +9,13 @@ from experiments.config import Config
 
 
 def prepare(
-    config: Config, data: str | None, out: Path, progress: Callable[[int, int], None], *, ranges: bool = False
+    config: Config,
+    data: str | None,
+    out: Path,
+    progress: Callable[[int, int], None],
+    *,
+    ranges: bool = False,
+    native: bool = False,
 ) -> Dataset:
     """Open ``data``, or render the built-in scenes into ``out / "scenes"`` (resumes; complete frames are kept).
 
@@ -19,9 +25,10 @@ def prepare(
       out: the run's folder.
       progress: called with frames done and in all.
       ranges: the run needs sample ranges.
+      native: the run needs colour at native resolution.
 
     Raises:
-      ValueError: the dataset lacks a split or the ranges that a run needs, or was rendered with other settings.
+      ValueError: the dataset lacks a split, ranges or colour that a run needs, or was rendered with other settings.
     """
     if data is not None:
         dataset = read_dataset(data)
@@ -45,6 +52,11 @@ def prepare(
         raise ValueError(
             f"{dataset.path}: a classifier is trained on labels made of the ranges over all samples of each reference "
             "pixel, which this dataset does not have. Render the scenes with --ranges; imported frames have none."
+        )
+    if native and not dataset.info.native:
+        raise ValueError(
+            f"{dataset.path}: all variants of this run work on frames at native resolution, which this dataset does "
+            "not have. Render the scenes with --native; imported frames have none."
         )
     return dataset
 

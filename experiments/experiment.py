@@ -24,7 +24,7 @@ from experiments.evaluate import Clip, Runner, evaluate, load_clip
 from experiments.report import print_table, write_report
 from experiments.report.classes import write_class_sheet
 from experiments.training import restore_stages, train_stages
-from experiments.variants import stages_of, trained_as
+from experiments.variants import VARIANTS, stages_of, trained_as
 from experiments.variants.classifier import thresholds
 
 
@@ -92,7 +92,8 @@ def run_experiment(
             progress.update(bar, completed=n, total=total, text=f"{n}/{total}")
 
         classifiers = [name for name in names if any(stage.ranges for stage in stages_of(name, configs[name]))]
-        dataset = datasets.prepare(config, data, out, on_frame, ranges=bool(classifiers))
+        native = all(VARIANTS[name].method(configs[name]).info.native for name in names)
+        dataset = datasets.prepare(config, data, out, on_frame, ranges=bool(classifiers), native=native)
         # Labels depend on the size of the image: a user's data has its own.
         size = (dataset.info.width, dataset.info.height)
         configs = {name: dataclasses.replace(each, size=size) for name, each in configs.items()}
@@ -138,7 +139,7 @@ def run_experiment(
     if classes:
         metrics["classes"] = classes
     references = table_references(runners, clips["test"][0].sequence.scale)
-    remarks = notes(dataset, clips["test"], settings, config)
+    remarks = notes(names, dataset, clips["test"], settings, config)
     remarks += [class_remark(name, scores) for name, scores in classes.items()]
     page = write_report(
         out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references

@@ -8,7 +8,7 @@ Conventions (those of ``grid_sample`` with ``align_corners=False``, in pixels): 
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -189,7 +189,7 @@ def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outsid
         image, positions = (jnp.broadcast_to(x, (*leading, *x.shape[-3:])) for x in (image, positions))
     image, positions = merge_leading_axes(image), merge_leading_axes(positions)
     differentiable = mode in CUBIC_PARAMETER and jnp.issubdtype(image.dtype, jnp.floating)
-    kernel: Callable[..., Array] = _sample_cubic if differentiable else _sample_taps
+    kernel = cast(Callable[..., Array], _sample_cubic if differentiable else _sample_taps)
     result = kernel(image, positions, mode, outside)
     return result.reshape(*leading, *result.shape[-3:])
 

@@ -89,13 +89,14 @@ def test_pictures(tmp_path):
     assert path == tmp_path / "report" / "labels-test-gloss-1-frame-7.png" and Image.open(path).size[0] > 900
 
 
-def test_data_without_ranges_is_refused_before_training(tmp_path):
+def test_data_without_ranges_or_native_frames_is_refused_before_training(tmp_path):
     sequence = jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), make_sequence(0, T, 1, H, W))
     write_sequence(tmp_path, "a", sequence)
     write_dataset(tmp_path, {split: ["a"] for split in ("train", "validation", "test")})
-    prepare = lambda ranges: datasets.prepare(  # noqa: E731
-        PRESETS["smoke"], str(tmp_path), tmp_path, lambda n, total: None, ranges=ranges
+    prepare = lambda **needs: datasets.prepare(  # noqa: E731
+        PRESETS["smoke"], str(tmp_path), tmp_path, lambda n, total: None, **needs
     )
-    assert not prepare(False).info.ranges
-    with pytest.raises(ValueError, match="does not have. Render the scenes with --ranges; imported frames have none"):
-        prepare(True)
+    assert not prepare().info.ranges
+    for need in ("ranges", "native"):
+        with pytest.raises(ValueError, match=f"not have. Render the scenes with --{need}; imported frames have none"):
+            prepare(**{need: True})

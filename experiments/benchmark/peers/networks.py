@@ -1,5 +1,6 @@
 """PyTorch mirrors of the networks, with our weights, in channels-last memory."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -168,10 +169,13 @@ def dlctus(p: Weights) -> Callable:
     return forward
 
 
+_OFFSETS = OFFSETS.tolist()  # torch.compile stumbles over NumPy
+
+
 def _shifted(x, right: float, down: float):
     """``x`` read at a constant offset in half pixels, at most 3: slices of the padded image and their means."""
     for axis, offset in ((-2, down), (-1, right)):
-        reach, whole = 4, int(np.floor(offset))
+        reach, whole = 4, math.floor(offset)
         padded = F.pad(x, (reach, reach, 0, 0) if axis == -1 else (0, 0, reach, reach), mode="replicate")
         near, far = (padded.narrow(axis, reach + whole + k, x.shape[axis]) for k in (0, 1))
         x = 0.5 * (near + far) if offset != whole else near
@@ -182,15 +186,14 @@ def _matched_flow(warped, roughness):
     """``networks.frnet.matched_flow``."""
     price = COST_PER_PIXEL * (1.0 + COST_OF_ROUGHNESS * (roughness - SMOOTH).clamp(min=0.0))
     costs = []
-    for x, y in OFFSETS.tolist():
+    for x, y in _OFFSETS:
         difference = _shifted(warped[:1], x, y) - _shifted(warped[1:], 3 * x, 3 * y)
         mean = difference.abs().mean(dim=1, keepdim=True)
         box = F.avg_pool2d(F.pad(mean, (PATCH // 2,) * 4, mode="replicate"), PATCH, stride=1)
-        costs.append(box + price * float(np.hypot(x, y)))
+        costs.append(box + price * math.hypot(x, y))
     weights = torch.softmax(-torch.cat(costs, dim=1) / TEMPERATURE, dim=1)
-    return F.conv2d(
-        weights, torch.tensor(OFFSETS.T[:, :, None, None].copy(), dtype=weights.dtype, device=weights.device)
-    )
+    offsets = torch.tensor(_OFFSETS, dtype=weights.dtype, device=weights.device)
+    return F.conv2d(weights, offsets.T[:, :, None, None])
 
 
 def frnet(p: Weights) -> Callable:

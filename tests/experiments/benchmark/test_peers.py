@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
 from experiments.benchmark import peers  # noqa: E402
 from experiments.benchmark.suites import networks, warp  # noqa: E402
@@ -31,6 +31,22 @@ def test_warps(name):
 def test_networks(name):
     forward = next(f for f in networks.forwards(45, 38) if f.name.split(",")[0] == name)
     assert _difference(networks.case(forward, "float32")) < peers.TOLERANCE
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_networks_can_be_compiled(name):
+    """By torch.compile's front end; its code generator takes minutes."""
+    forward = next(f for f in networks.forwards(45, 38) if f.name.split(",")[0] == name)
+    case = networks.case(forward, "float32")
+    function, tensors = peers.find(case.name).make(jax.tree.map(np.asarray, case.arguments))
+    with torch.inference_mode():
+        compiled = torch.compile(function, dynamic=False, backend="eager")(*tensors)
+        for ours, theirs in zip(_outputs(compiled), _outputs(function(*tensors)), strict=True):
+            torch.testing.assert_close(ours, theirs)
+
+
+def _outputs(output):
+    return output if isinstance(output, tuple) else (output,)
 
 
 def test_a_wrong_peer_is_not_timed(monkeypatch):
