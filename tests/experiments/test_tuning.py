@@ -1,0 +1,40 @@
+"""Which setting of a TAA method is chosen, from scores that the test makes up."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments import tuning
+from experiments.config import PRESETS
+from experiments.variants import get_variant
+
+BASE = 25.0
+
+
+def choose(monkeypatch, gains, best=(0.4, 0.8)):
+    """The setting chosen where "none" gains ``gains`` on the clips over the usual clamp, and ``best`` wins in both."""
+
+    def score(method, grid, clip):
+        near = -np.abs(grid[:, 0] - best[0]) - np.abs(grid[:, 1] - best[1])
+        return BASE + near + (gains[clip] if method == "none" else 0.0)
+
+    variant = dataclasses.replace(get_variant("taau"), method=lambda config, *, clamp: clamp)
+    monkeypatch.setattr(tuning, "_score_grid", score)
+    return tuning.tune(variant, PRESETS["quick"], list(range(len(gains))))
+
+
+@pytest.mark.parametrize(
+    ("gains", "clamp"),
+    [
+        ([0.3, 0.4, 0.3], "none"),  # on every clip
+        ([1.0, -0.6, -0.1], "ycocg"),  # on average, by one clip
+        ([-0.1, -0.1, -0.2], "ycocg"),
+        ([0.1], "none"),  # one clip: nothing is known of the spread
+    ],
+)
+def test_another_clamp_must_win_beyond_doubt(monkeypatch, gains, clamp):
+    chosen = choose(monkeypatch, gains)
+    assert chosen.clamp == clamp
+    assert (chosen.alpha, chosen.sigma) == (0.4, 0.8)
+    assert chosen.psnr == pytest.approx(BASE + (np.mean(gains) if clamp == "none" else 0.0), abs=1e-5)
