@@ -19,7 +19,7 @@ from essjax.warp import backward_warp
 
 LEVELS = 3
 OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-1.0, 1.5, 0.5)]), axis=-1).reshape(-1, 2).astype(np.float32)
-"""Flows that ``matched_flow`` tries, (x, y) half-size pixels per rendered frame; half pixels."""
+"""Flows that ``matched_flow`` tries, (x, y) half-size pixels per rendered frame; multiples of 0.5."""
 REACH = 3
 """Pixels that the older frame is read away at most: three times the largest of them."""
 PATCH = 7

@@ -28,8 +28,10 @@ SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
 """Base colour, normal: a starting value measured on a path-traced clip; the paper gives none."""
 SIGMA_DISTANCE = 2.0
 _ID_MASK = 63  # 6 bits hold a candidate's number
-_BORDER = 1e18  # scaled guides are below this, and so far apart (squared) is a candidate outside
-_UNUSABLE = 1e34
+_LIMIT = 1e15  # scaled guides beyond this match nothing
+_BORDER = 1e17  # the scaled guide of what cannot be used: squared, and summed over channels, still finite
+_UNUSABLE = 1e33  # costs of candidates with such a guide are above, all others below
+_LEAST_SIGMA = 1e-13  # smaller ones count as this: costs stay finite
 _LEAST = 1e-30  # added to costs: their keys are normal numbers, which no backend flushes to zero
 _REACH = max(STRIDES)
 _FAR = 1e6  # pixels; keeps integers from overflowing
@@ -83,7 +85,7 @@ def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) ->
 
     def scaled(image: Array, instead: float) -> list[Array]:
         planes = [image[..., k] * scale[k] for k in range(channels)]
-        return [jnp.where(jnp.abs(plane) < _BORDER, plane, instead) for plane in planes]
+        return [jnp.where(jnp.abs(plane) < _LIMIT, plane, instead) for plane in planes]
 
     planes = [jnp.pad(p, margin, constant_values=_BORDER).reshape(-1) for p in scaled(guide_previous, _BORDER)]
     planes = jax.lax.optimization_barrier(planes)
@@ -215,7 +217,8 @@ def _inverse_variances(sigma_guide, sigma_distance, channels: int) -> Array:
             f"{sigma_guide.shape}."
         )
     distance = jnp.broadcast_to(jnp.asarray(sigma_distance, jnp.float32), (2,))
-    return 1.0 / jnp.concatenate([jnp.broadcast_to(sigma_guide, (channels,)), distance]) ** 2
+    sigmas = jnp.concatenate([jnp.broadcast_to(sigma_guide, (channels,)), distance])
+    return 1.0 / jnp.maximum(sigmas, _LEAST_SIGMA) ** 2
 
 
 def _run(kernel, images, guide_previous, guide, motion, sigma_guide, sigma_distance, implementation):

@@ -247,6 +247,21 @@ def test_the_network_chooses_what_sorting_chooses(size):
     assert used.mean() > 0.2
 
 
+@pytest.mark.parametrize(("sigma", "size"), [(1e-25, 1.0), (1e-3, 1e20), (1e-13, 1e3), (1e-18, 1e-30)])
+def test_extreme_guides_and_sigmas_stay_finite(sigma, size):
+    """Also where scaled guides leave float32's range: every pixel is a mean of pixels, by both ways of selection."""
+    radiance, guide_previous, guide, motion = scene(13)
+    arguments = radiance, guide_previous * np.float32(size), guide * np.float32(size), motion
+    network, sorting = (
+        jax.jit(
+            lambda *a, name=name: gbuffer_guided_warp(*a, sigma_guide=sigma, sigma_distance=sigma, implementation=name)
+        )(*arguments)
+        for name in ("network", "reference")
+    )
+    np.testing.assert_array_equal(network, sorting)
+    assert radiance.min() - 1e-5 <= np.min(network) and np.max(network) <= radiance.max() + 1e-5
+
+
 def test_motion_without_a_finite_number_leaves_the_border_pixel_rule():
     radiance, guide_previous, guide, _ = scene(12)
     nowhere = np.full((H, W, 2), np.inf, np.float32)
