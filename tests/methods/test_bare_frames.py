@@ -77,10 +77,13 @@ def test_a_comparison_leaves_out_what_lacks_a_buffer_and_says_so():
     assert comparison.unfit(methods.extrass_w(), poor) == "this dataset has no base_color, normal"
     assert comparison.unfit(methods.taau(2), poor) == ""
     config, holes = make_config("smoke", []), np.zeros((3, 12, 18, 1))
+    asked = ["bilinear", "extranet+taa"]
     remarks = {
-        name: comparison.notes(None, [Clip("a", s, (0, 1, 2), [1, 2], holes, False)], {}, config)  # type: ignore[arg-type]
+        name: comparison.notes(asked, None, [Clip("a", s, (0, 1, 2), [1, 2], holes, False)], {}, config)  # type: ignore[arg-type]
         for name, s in (("rich", sequence), ("poor", poor))
     }
+    for row in ("taa", "extranet+taa"):
+        assert f"No {row} row: this dataset has no colour at native resolution." in remarks["rich"]
     assert "No extrass-w row: this dataset has no base_color, normal." in remarks["poor"]
     assert not any("extrass-w" in remark for remark in remarks["rich"])
 
