@@ -198,6 +198,7 @@ def _weigh(
     weights = jnp.stack([exponential / total for exponential in exponentials])
     # The pixels once more, rank by rank: four stacked planes would have to be written out, these fuse.
     winners = [_winner(packed, k, motion) for k in range(WINNERS)]
+    # The barrier halves the time: without it every channel of the image computes the weights again.
     return jax.lax.optimization_barrier(weights), tuple(row * width + column for _, column, row in winners)
 
 

@@ -84,6 +84,13 @@ def bilinear_twice(x):
     return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
+def depth_to_space(x, block: int):
+    """As ``warp.depth_to_space``: channels are (row, column, output); ``pixel_shuffle``'s are (output, row, column)."""
+    batch, _, rows, columns = x.shape
+    x = x.reshape(batch, block, block, -1, rows, columns).permute(0, 3, 4, 1, 5, 2)
+    return x.reshape(batch, -1, rows * block, columns * block)
+
+
 def pad_to(x, multiple: int):
     """Repeat the last row and column."""
     return F.pad(x, (0, -x.shape[-1] % multiple, 0, -x.shape[-2] % multiple), mode="replicate")

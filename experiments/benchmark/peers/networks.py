@@ -19,6 +19,7 @@ from experiments.benchmark.peers.layers import (
     conv,
     conv_block,
     conv_norm,
+    depth_to_space,
     gated,
     pad_to,
     replicated,
@@ -91,10 +92,7 @@ def dlctus(p: Weights) -> Callable:
         x = conv(pad_to(x, block), p["Conv_0"], block, 0)
         for n in range(1, len(p), 2):
             x = x + replicated(F.relu(replicated(x, p[f"Conv_{n}"])), p[f"Conv_{n + 1}"])
-        batch, channels, rows, columns = x.shape
-        # Our channels are (row, column, output); pixel_shuffle's would be (output, row, column).
-        x = x.reshape(batch, block, block, -1, rows, columns).permute(0, 3, 4, 1, 5, 2)
-        return x.reshape(batch, -1, rows * block, columns * block)[..., :height, :width]
+        return depth_to_space(x, block)[..., :height, :width]
 
     return forward
 
@@ -168,15 +166,10 @@ def ifrnet(p: Weights) -> Callable:
             y = torch.cat([y[:, :-side], last], dim=1)
         return prelu(x + conv(y, p["Conv_4"]), p["PReLU_4"])
 
-    def shuffled(x):
-        # Our channels are (row, column, output); pixel_shuffle's are (output, row, column).
-        batch, channels, rows, columns = x.shape
-        x = x.reshape(batch, 2, 2, channels // 4, rows, columns).permute(0, 3, 4, 1, 5, 2)
-        return x.reshape(batch, channels // 4, 2 * rows, 2 * columns)
-
     def decoder(x, p, side) -> tuple[torch.Tensor, Any]:
         x = interlaced(prelu(conv(x, p["Conv_0"]), p["PReLU_0"]), p["Interlaced_0"], side)
-        return shuffled(conv(x, p["Conv_1"])), shuffled(conv(x, p["Conv_2"])) if "Conv_2" in p else None
+        refined = depth_to_space(conv(x, p["Conv_1"]), 2)
+        return refined, depth_to_space(conv(x, p["Conv_2"]), 2) if "Conv_2" in p else None
 
     def both(refined):
         return torch.cat([refined[:, :2], refined[:, 2:4]])
@@ -233,10 +226,6 @@ def nsrr(p: Weights) -> Callable:
 def fasset(p: Weights, scale: float = 2) -> Callable:
     """``FASSET.render``."""
 
-    def gate(x, p):
-        both = conv(x, p["Conv_0"])
-        return F.relu(2 * torch.sigmoid(both[:, -1:]) * both[:, :-1])
-
     def recurrent(hidden, x, p):
         update, reset = torch.sigmoid(conv(torch.cat([hidden, x], dim=1), p["Conv_0"])).chunk(2, dim=1)
         candidate = torch.tanh(conv(torch.cat([reset * hidden, x], dim=1), p["Conv_1"]))
@@ -247,7 +236,7 @@ def fasset(p: Weights, scale: float = 2) -> Callable:
         for level, numbers in enumerate((range(3), range(3, 5), range(5, 7))):
             x = F.avg_pool2d(x, 2) if level else x
             for n in numbers:
-                x = gate(x, p[f"GatedConv_{n}"])
+                x = F.relu(2 * gated(x, p[f"GatedConv_{n}"]))
             x = x if level else recurrent(hidden, x, p["ConvGRU_0"])
             features.append(x)
         return decode(features, p["Decoder_0"])
