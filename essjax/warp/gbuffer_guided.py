@@ -9,7 +9,7 @@ part that gradients see.
 """
 
 import functools
-from functools import partial
+import importlib.util
 
 import jax
 import jax.numpy as jnp
@@ -28,14 +28,17 @@ SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
 """Base colour, normal: a starting value measured on a path-traced clip; the paper gives none."""
 SIGMA_DISTANCE = 2.0
 _ID_MASK = 63  # 6 bits hold a candidate's number
-_LIMIT = 1e15  # scaled guides beyond this match nothing
-_BORDER = 1e17  # the scaled guide of what cannot be used: squared, and summed over channels, still finite
-_UNUSABLE = 1e33  # costs of candidates with such a guide are above, all others below
+LIMIT = 1e15  # scaled guides beyond this match nothing
+BORDER = 1e17  # the scaled guide of what cannot be used: squared, and summed over channels, still finite
+UNUSABLE = 1e33  # costs of candidates with such a guide are above, all others below
 _LEAST_SIGMA = 1e-13  # smaller ones count as this: costs stay finite
-_LEAST = 1e-30  # added to costs: their keys are normal numbers, which no backend flushes to zero
+LEAST = 1e-30  # added to costs: their keys are normal numbers, which no backend flushes to zero
 _REACH = max(STRIDES)
-_FAR = 1e6  # pixels; keeps integers from overflowing
-IMPLEMENTATIONS = ("network", "reference")
+MARGIN = 2 * _REACH + 1
+"""Pixels around the planes of the previous guides that match nothing: reads never need a comparison of positions."""
+FAR = 1e6  # pixels; keeps integers from overflowing
+SELECTIONS = ("network", "reference")
+IMPLEMENTATIONS = ("auto", *SELECTIONS, "triton")
 
 
 def candidate_offsets() -> np.ndarray:
@@ -73,6 +76,12 @@ def _coordinates(motion: Array) -> tuple[Array, Array]:
     return x + motion[..., 0], y + motion[..., 1]
 
 
+def _scaled(image: Array, scale: Array, instead: float) -> list[Array]:
+    """Planes of guides in units of their sigmas (times the root of 2); ``instead`` of what can match nothing."""
+    planes = [image[..., k] * scale[k] for k in range(image.shape[-1])]
+    return [jnp.where(jnp.abs(plane) < LIMIT, plane, instead) for plane in planes]
+
+
 def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> list[Array]:
     """The key of each of the 33 candidates, ``[H, W]``: the bits of its cost, the low 6 its number, read as a float."""
     height, width, channels = guide.shape
@@ -80,29 +89,23 @@ def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) ->
     # never usable, without any comparison of positions; so is what is not finite. One plane per channel, as gathers of
     # single numbers are cheapest.
     scale = jnp.sqrt(0.5 * inverse)
-    margin = 2 * _REACH + 1
-    stride = width + 2 * margin
-
-    def scaled(image: Array, instead: float) -> list[Array]:
-        planes = [image[..., k] * scale[k] for k in range(channels)]
-        return [jnp.where(jnp.abs(plane) < _LIMIT, plane, instead) for plane in planes]
-
-    planes = [jnp.pad(p, margin, constant_values=_BORDER).reshape(-1) for p in scaled(guide_previous, _BORDER)]
+    stride = width + 2 * MARGIN
+    planes = [jnp.pad(p, MARGIN, constant_values=BORDER).reshape(-1) for p in _scaled(guide_previous, scale, BORDER)]
     planes = jax.lax.optimization_barrier(planes)
-    here = scaled(guide, -_BORDER)
+    here = _scaled(guide, scale, -BORDER)
     x, y = _coordinates(motion)
     # Beyond this clamp all candidates are outside already.
     x = jnp.clip(x, -_REACH - 0.5, width + _REACH + 0.5)
     y = jnp.clip(y, -_REACH - 0.5, height + _REACH + 0.5)
     column, row = jnp.floor(x), jnp.floor(y)
-    start = (row.astype(jnp.int32) + margin) * stride + column.astype(jnp.int32) + margin
+    start = (row.astype(jnp.int32) + MARGIN) * stride + column.astype(jnp.int32) + MARGIN
     fraction = (x - column - 0.5, y - row - 0.5)
     keys = []
     for candidate, offset in enumerate(candidate_offsets()):
         index = start + int(offset[1] * stride + offset[0])
         away = [scale[channels + k] * (fraction[k] - float(offset[k])) for k in range(2)]
         apart = [here[k] - gather_pixels(planes[k], index) for k in range(channels)]
-        cost = jnp.asarray(sum((d * d for d in [*away, *apart]), start=_LEAST))
+        cost = jnp.asarray(sum((d * d for d in [*away, *apart]), start=LEAST))
         bits = jax.lax.bitcast_convert_type(cost, jnp.int32) & ~_ID_MASK
         keys.append(jax.lax.bitcast_convert_type(bits | candidate, jnp.float32))
     return keys
@@ -131,7 +134,7 @@ def _best_by_sorting(keys: list[Array]) -> list[Array]:
 def _pack(best: list[Array]) -> Array:
     """Numbers of the winners, 6 bits each; ``_ID_MASK`` where the candidate cannot be used."""
     bits = [jax.lax.bitcast_convert_type(key, jnp.int32) & _ID_MASK for key in best]
-    numbers = [jnp.where(key < _UNUSABLE, number, _ID_MASK) for key, number in zip(best, bits, strict=True)]
+    numbers = [jnp.where(key < UNUSABLE, number, _ID_MASK) for key, number in zip(best, bits, strict=True)]
     return sum(number << (6 * rank) for rank, number in enumerate(numbers))  # type: ignore[return-value]
 
 
@@ -143,7 +146,7 @@ def _winner(packed: Array, rank: Array | int, motion: Array) -> tuple[Array, Arr
     number = jnp.where(usable, number, 0)
     place = []
     for k, coordinate in enumerate(_coordinates(motion)):
-        center = jnp.floor(jnp.clip(coordinate, -_FAR, _FAR)).astype(jnp.int32)
+        center = jnp.floor(jnp.clip(coordinate, -FAR, FAR)).astype(jnp.int32)
         offset = gather_pixels(jnp.asarray(candidate_offsets()[:, k]), number)
         place.append(jnp.clip(center + offset, 0, motion.shape[1 - k] - 1))
     return usable, place[0], place[1]
@@ -176,11 +179,10 @@ def _select(implementation: str, *arrays: Array) -> Array:
 
 
 def _weigh(
-    guide_previous: Array, guide: Array, motion: Array, inverse: Array, *, implementation: str
+    guide_previous: Array, guide: Array, motion: Array, inverse: Array, packed: Array
 ) -> tuple[Array, tuple[Array, ...]]:
     """Weights ``[4, H, W]`` and pixel numbers, four of ``[H, W]``, of the winners; all that gradients pass through."""
     height, width, channels = guide.shape
-    packed = _select(implementation, *jax.lax.stop_gradient((guide_previous, guide, motion, inverse)))
     rank = jnp.arange(WINNERS, dtype=jnp.int32)[:, None, None]
     usable, column, row = _winner(packed, rank, motion)
     flat, pixel = guide_previous.reshape(-1), row * width + column
@@ -202,12 +204,50 @@ def _weigh(
     return jax.lax.optimization_barrier(weights), tuple(row * width + column for _, column, row in winners)
 
 
-def _warp_one(radiance: Array, *arrays: Array, implementation: str) -> Array:
-    weights, pixels = _weigh(*arrays, implementation=implementation)
+def _blend(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array, packed: Array) -> Array:
+    weights, pixels = _weigh(guide_previous, guide, motion, inverse, packed)
     flat = radiance.reshape(-1, radiance.shape[-1])
     values = [gather_pixels(flat, pixel).astype(jnp.float32) for pixel in pixels]
     total = sum(weight[..., None] * value for weight, value in zip(weights, values, strict=True))
     return jnp.asarray(total).astype(radiance.dtype)
+
+
+@jax.custom_jvp
+def _warp_by_kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> Array:
+    return _kernel(radiance, guide_previous, guide, motion, inverse)[0]
+
+
+@_warp_by_kernel.defjvp
+def _derivative(primals, tangents):
+    image, packed = _kernel(*primals)
+    return image, jax.jvp(lambda *arrays: _blend(*arrays, packed), primals, tangents)[1]
+
+
+def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> list[Array]:
+    """The Triton kernel on one image: the warped image, and which candidates won (as ``_select``)."""
+    from essjax.warp.gbuffer_guided_triton import guided  # an optional package
+
+    scale = jnp.sqrt(0.5 * inverse)
+    pad = ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN))
+    planes = jnp.pad(jnp.stack(_scaled(guide_previous, scale, BORDER)), pad, constant_values=BORDER)
+    return [array[0] for array in guided(*(array[None] for array in (radiance, planes, guide, motion, scale)))]
+
+
+def _chosen(implementation: str, known: tuple[str, ...] = IMPLEMENTATIONS) -> str:
+    """The implementation that is used.
+
+    Raises:
+      ValueError: not one of ``known``, or it cannot run here.
+    """
+    if implementation not in known:
+        raise ValueError(f"implementation: expected one of {', '.join(known)}, got {implementation!r}.")
+    runs = jax.default_backend() == "gpu" and importlib.util.find_spec("jax_triton") is not None
+    if implementation == "triton" and not runs:
+        raise ValueError(
+            f"implementation: 'triton' needs a GPU and the package jax-triton, and JAX runs on "
+            f"{jax.default_backend()}. Install essjax[gpu], or leave the choice to 'auto'."
+        )
+    return ("triton" if runs else "network") if implementation == "auto" else implementation
 
 
 def _inverse_variances(sigma_guide, sigma_distance, channels: int) -> Array:
@@ -222,9 +262,7 @@ def _inverse_variances(sigma_guide, sigma_distance, channels: int) -> Array:
     return 1.0 / jnp.maximum(sigmas, _LEAST_SIGMA) ** 2
 
 
-def _run(kernel, images, guide_previous, guide, motion, sigma_guide, sigma_distance, implementation):
-    if implementation not in IMPLEMENTATIONS:
-        raise ValueError(f"implementation: expected one of {', '.join(IMPLEMENTATIONS)}, got {implementation!r}.")
+def _run(kernel, images, guide_previous, guide, motion, sigma_guide, sigma_distance):
     check_channels("guide", guide, None)
     size = guide.shape[-3:-1]
     for image in images:
@@ -233,7 +271,6 @@ def _run(kernel, images, guide_previous, guide, motion, sigma_guide, sigma_dista
     check_channels("motion", motion, 2, size)
     inverse = _inverse_variances(sigma_guide, sigma_distance, guide.shape[-1])
     arrays = (*images, guide_previous.astype(jnp.float32), guide.astype(jnp.float32), motion.astype(jnp.float32))
-    kernel = partial(kernel, implementation=implementation)
     return over_leading_axes(kernel, (3,) * len(arrays) + (1,), *arrays, inverse)
 
 
@@ -245,7 +282,7 @@ def gbuffer_guided_warp(
     *,
     sigma_guide: float | Array | tuple[float, ...] = SIGMA_GUIDE,
     sigma_distance: float | Array = SIGMA_DISTANCE,
-    implementation: str = "network",
+    implementation: str = "auto",
 ) -> Image:
     """Blend, of 33 pixels around the reprojected position, the four whose G-buffers fit best (ExtraSS eq 1-3).
 
@@ -264,16 +301,25 @@ def gbuffer_guided_warp(
       motion: ``[..., H, W, 2]`` pixels, the jitter difference included (``jittered_motion``).
       sigma_guide: one number, or one per guide channel (the default is for ``guides``), > 0.
       sigma_distance: pixels, > 0.
-      implementation: of the selection. "network" is fast on every backend; "reference" sorts 33 stacked keys, needs 30
-        times the memory, and chooses the same.
+      implementation: "network" runs on every backend; "triton" is one kernel for GPUs, needs ``jax-triton``; "auto"
+        takes that where it runs, else the network; "reference" sorts 33 stacked keys, needs 30 times the memory. All
+        choose the same.
 
     Returns:
       ``[..., H, W, C]``.
 
     Raises:
-      ValueError: sizes differ, ``sigma_guide`` is neither a number nor one per channel, or unknown implementation.
+      ValueError: sizes differ, ``sigma_guide`` is neither a number nor one per channel, or the implementation is
+        unknown or cannot run here.
     """
-    return _run(_warp_one, (radiance,), guide_previous, guide, motion, sigma_guide, sigma_distance, implementation)
+    chosen = _chosen(implementation)
+
+    def warp(radiance, *arrays):
+        if chosen == "triton":
+            return _warp_by_kernel(radiance, *arrays)
+        return _blend(radiance, *arrays, _select(chosen, *jax.lax.stop_gradient(arrays)))
+
+    return _run(warp, (radiance,), guide_previous, guide, motion, sigma_guide, sigma_distance)
 
 
 def guided_weights(
@@ -291,5 +337,10 @@ def guided_weights(
       Weights ``[..., H, W, 4]``, sum 1, best first, and pixel numbers ``[..., H, W, 4]`` (row * W + column) in the
       previous frame; a number whose weight is 0 has no meaning.
     """
-    weights, pixels = _run(_weigh, (), guide_previous, guide, motion, sigma_guide, sigma_distance, implementation)
+    chosen = _chosen(implementation, SELECTIONS)
+
+    def weigh(*arrays):
+        return _weigh(*arrays, _select(chosen, *jax.lax.stop_gradient(arrays)))
+
+    weights, pixels = _run(weigh, (), guide_previous, guide, motion, sigma_guide, sigma_distance)
     return jnp.moveaxis(weights, -3, -1), jnp.stack(pixels, axis=-1)

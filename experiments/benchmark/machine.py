@@ -2,19 +2,21 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from experiments.benchmark.measure import Case, measure
 
 
-def roofline(repetitions: int, *, megabytes: int = 256, size: int = 2048) -> dict[str, float]:
+def roofline(repetitions: int, *, megabytes: int = 256, size: int | None = None) -> dict[str, float]:
     """Bytes per second of a copy in place and FLOP/s of a matrix product, float32 and bfloat16.
 
     Args:
       repetitions: of each.
       megabytes: size of the array that is copied; larger than the caches.
-      size: rows and columns of the matrices.
+      size: rows and columns of the matrices; None: 2048, on a GPU 8192.
     """
+    size = size or (8192 if jax.default_backend() == "gpu" else 2048)
     array = jnp.zeros(megabytes * 250_000, jnp.float32)
     # Donated: into a fresh array each call would measure the allocator.
     copy = measure(
@@ -22,7 +24,7 @@ def roofline(repetitions: int, *, megabytes: int = 256, size: int = 2048) -> dic
     )
     found = {"copy_bytes_per_second": 2e6 * megabytes / (1e-3 * copy["median_ms"])}
     for dtype in (jnp.float32, jnp.bfloat16):
-        matrix = jnp.ones((size, size), dtype)
+        matrix = jax.random.normal(jax.random.key(0), (size, size), dtype)
         row = measure(Case("product", jnp.matmul, (matrix, matrix)), repetitions)
         found[f"{jnp.dtype(dtype).name}_flops_per_second"] = 2.0 * size**3 / (1e-3 * row["median_ms"])
     return found

@@ -1,8 +1,10 @@
 """One timed case: warm-up, repetitions that each wait for their result, what XLA knows of the program."""
 
 import gc
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -10,9 +12,13 @@ import jax.monitoring
 import numpy as np
 
 from essjax.deploy import multiply_adds
+from experiments.trace import device_milliseconds
 
 REPETITIONS = 20
 WARM_UP = 2
+QUEUED = {"gpu": 10}
+"""Backend -> calls per repetition, one behind the other before the clock stops. A single short call on a GPU measures
+its launch and the wait for it; in a renderer there is always more in the queue."""
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 _LOWERING_EVENTS = ("/jax/core/compile/jaxpr_trace_duration", "/jax/core/compile/jaxpr_to_mlir_module_duration")
 
@@ -61,18 +67,40 @@ class Compilations:
             self.seconds += duration_secs
 
 
-def time_calls(call: Callable[[], Any], repetitions: int, *, warm_up: int = WARM_UP) -> np.ndarray:
-    """Seconds of each call ``[repetitions]``; ``call`` must return only when its result is there."""
+def queued_calls() -> int:
+    """Calls per repetition on the default backend."""
+    return QUEUED.get(jax.default_backend(), 1)
+
+
+def time_calls(
+    call: Callable[[], Any],
+    repetitions: int,
+    *,
+    wait: Callable[[Any], Any] = lambda output: None,
+    queued: int = 1,
+    warm_up: int = WARM_UP,
+) -> np.ndarray:
+    """Seconds per call ``[repetitions]``.
+
+    Args:
+      call: starts the work; it need not be done when this returns.
+      repetitions: of the measurement.
+      wait: for the output of a call; returns when all calls so far are done.
+      queued: calls of one repetition, one wait after the last.
+      warm_up: calls before.
+    """
     for _ in range(warm_up):
-        call()
+        wait(call())
     seconds = np.empty(repetitions)
     gc.collect()
     gc.disable()  # a collection in the middle of a call would be charged to it
     try:
         for n in range(repetitions):
             start = time.perf_counter()
-            call()
-            seconds[n] = time.perf_counter() - start
+            for _ in range(queued):
+                output = call()
+            wait(output)
+            seconds[n] = (time.perf_counter() - start) / queued
     finally:
         gc.enable()
     return seconds
@@ -101,19 +129,32 @@ def measure(case: Case, repetitions: int = REPETITIONS) -> dict[str, Any]:
         compiled = jitted.lower(*arguments).compile()
     state = {"arguments": arguments}
 
-    def call() -> None:
-        output = jax.block_until_ready(compiled(*state["arguments"]))
+    def call() -> Any:
+        output = compiled(*state["arguments"])
         state["arguments"] = case.following(state["arguments"], output)
+        return output
 
     with Compilations() as timing:
-        seconds = time_calls(call, repetitions)
+        seconds = time_calls(call, repetitions, wait=jax.block_until_ready, queued=queued_calls())
     if timing.count:
         raise RuntimeError(f"{case.name}: compiled {timing.count} times while the clock ran.")
     row = {"name": case.name, "implementation": case.implementation, **summary(seconds)}
     row |= {"compile_seconds": building.seconds, "compilations": building.count}
-    row |= _program(compiled, case)
+    row |= _program(compiled, case) | device_time(call)
     row["work"] = dict(case.work)
     return row
+
+
+def device_time(call: Callable[[], Any], calls: int = 10) -> dict[str, float]:
+    """``device_ms``: for how long one call keeps a GPU busy, by the profiler; nothing on other backends."""
+    if jax.default_backend() != "gpu":
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            for _ in range(calls):
+                output = call()
+            jax.block_until_ready(output)
+        return {"device_ms": device_milliseconds(Path(folder)) / calls}
 
 
 def _program(compiled: Any, case: Case) -> dict[str, Any]:

@@ -12,7 +12,7 @@ OPTIONAL = {
     "dtype": str, "compile_seconds": float, "compilations": int, "temporary_megabytes": float, "peak_megabytes": float,
     "least_bytes": float, "xla_bytes": float, "xla_flops": float, "flops": float, "roofline_fraction": float,
     "parameters": int, "latency": dict, "difference_from_unrolled": float, "difference_from_essjax": float,
-    "waiting_fraction": float,
+    "waiting_fraction": float, "device_ms": float,
 }  # fmt: skip
 
 

@@ -42,6 +42,7 @@ def _table(rows: list[dict[str, Any]]) -> list[str]:
         "by": lambda row: row["implementation"] + (f", {row['dtype']}" if "dtype" in row else ""),
         "median, ms": lambda row: _short(row["median_ms"]),
         "IQR, ms": lambda row: _short(row["iqr_ms"], 2),
+        "device, ms": lambda row: _short(row["device_ms"]) if "device_ms" in row else "",
         "over essjax": lambda row: _ratio(row, ours),
         "rate": _rate,
         "GFLOP/s": lambda row: _per_second(row, "flops", 1e9),

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.benchmark.measure import Case, summary, time_calls
+from experiments.benchmark.measure import Case, queued_calls, summary, time_calls
 from experiments.benchmark.peers import plain_c
 
 TOLERANCE = 1e-4
@@ -82,16 +82,17 @@ def _row(case: Case, peer: Peer, mode: str, repetitions: int, dtype: str, ours: 
 
     def call() -> Any:
         with torch.inference_mode():
-            output = function(*tensors)
-            if device == "cuda":
-                torch.cuda.synchronize()
-        return output
+            return function(*tensors)
 
-    first = time_calls(call, 1, warm_up=0)
+    def wait(output: Any) -> None:
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    first = time_calls(call, 1, wait=wait, warm_up=0)
     difference = _difference(peer.back(call()), ours, peer.ties)
     if dtype == "float32" and not difference < (TOLERANCE if device == "cpu" else GPU_TOLERANCE):
         raise RuntimeError(f"{case.name}: PyTorch ({mode}) differs from essjax by {difference:.2g}, not timed.")
-    seconds = time_calls(call, repetitions)
+    seconds = time_calls(call, repetitions, wait=wait, queued=queued_calls() if device == "cuda" else 1)
     row = {"name": case.name, "implementation": f"torch {mode}", **summary(seconds), "work": dict(case.work)}
     return {**row, "compile_seconds": float(first[0]), "difference_from_essjax": difference}
 

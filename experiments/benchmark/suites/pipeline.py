@@ -9,12 +9,12 @@ import numpy as np
 
 from essjax import methods
 from essjax.deploy import count_parameters
-from essjax.frames import without_color
+from essjax.frames import Frame, without_color
 from essjax.interfaces import Method
 from essjax.rollout import ESS, SS, alternate, every, stream_step, unroll
 from essjax.typing import PyTree
 from experiments.benchmark import inputs
-from experiments.benchmark.measure import Compilations, summary
+from experiments.benchmark.measure import Compilations, device_time, summary
 from experiments.benchmark.suites import Options, Row
 
 DISTINCT = 8
@@ -22,6 +22,7 @@ DISTINCT = 8
 COMPARED = 6
 """Frames on which streaming is compared with the unrolled method."""
 BINS = 20
+RESIDENT = "essjax, frames on the device"
 
 
 def streamed_methods() -> dict[str, Method]:
@@ -38,7 +39,7 @@ def streamed_methods() -> dict[str, Method]:
 
 
 def stream(
-    method: Method, steps: dict[str, Callable], variables: PyTree, frames: list, count: int
+    method: Method, steps: dict[str, Callable], variables: PyTree, frames: list, count: int, *, resident: bool = False
 ) -> dict[str, np.ndarray]:
     """Seconds of each frame by kind, frame into the device and image out of it included; everything else is refused.
 
@@ -48,20 +49,35 @@ def stream(
       variables: on the device.
       frames: on the host, rendered in turn.
       count: frames to stream.
+      resident: frames are on the device already, and images stay there, as in a renderer on the same GPU.
     """
     kinds = (every() if method.info.renders_all else alternate()).kinds(count)
     seconds: dict[str, list[float]] = {kind: [] for kind in dict.fromkeys(kinds)}
     history = method.start(jax.device_put(frames[0]))
+    given = {SS: frames, ESS: [without_color(frame) for frame in frames]}
+    given = jax.block_until_ready(jax.device_put(given)) if resident else given
     for n, kind in enumerate(kinds):
-        frame = frames[n % len(frames)]
         start = time.perf_counter()
-        frame = jax.device_put(frame if kind == SS else without_color(frame))
+        frame = jax.device_put(given[kind][n % len(frames)])
         with jax.transfer_guard("disallow"):
             history, image = steps[kind](variables, history, frame)
             image.block_until_ready()
-        jax.device_get(image)
+        if not resident:
+            jax.device_get(image)
         seconds[kind].append(time.perf_counter() - start)
     return {kind: np.array(values) for kind, values in seconds.items()}
+
+
+def busy(method: Method, step: Callable, variables: PyTree, frame: Frame) -> dict[str, float]:
+    """``device_ms`` of one kind of frame, see ``measure.device_time``."""
+    state = [method.start(frame)]
+
+    def call():
+        state[0], image = step(variables, state[0], frame)
+        return image
+
+    call()
+    return device_time(call)
 
 
 def largest_difference(method: Method, steps: dict[str, Callable], variables: PyTree, frames: list) -> float:
@@ -98,20 +114,24 @@ def _method_rows(
         with Compilations() as building[kind]:
             history, _ = jax.block_until_ready(steps[kind](variables, history, given))
     difference = largest_difference(method, steps, variables, frames) if dtype == "float32" else None
-    with Compilations() as streaming:
-        seconds = stream(method, steps, variables, frames, options.frames)
-    if streaming.count:
-        raise RuntimeError(f"{name}: compiled {streaming.count} times while streaming.")
-    for kind in kinds:
-        if kind not in method.info.predicts:
-            continue
-        row: dict[str, Any] = {"name": f"{name} {kind.upper()}, {options.width}x{options.height}"}
-        row |= {"implementation": "essjax", "dtype": dtype, **summary(seconds[kind])}
-        row |= {"compile_seconds": building[kind].seconds, "compilations": building[kind].count}
-        row |= {"latency": latency(seconds[kind]), "work": {"frames": 1.0}}
-        if difference is not None:
-            row["difference_from_unrolled"] = difference
-        yield row
+    for resident in (True, False) if jax.default_backend() == "gpu" else (False,):
+        with Compilations() as streaming:
+            seconds = stream(method, steps, variables, frames, options.frames, resident=resident)
+        if streaming.count:
+            raise RuntimeError(f"{name}: compiled {streaming.count} times while streaming.")
+        for kind in kinds:
+            if kind not in method.info.predicts:
+                continue
+            row: dict[str, Any] = {"name": f"{name} {kind.upper()}, {options.width}x{options.height}"}
+            row |= {"implementation": RESIDENT if resident else "essjax", "dtype": dtype, **summary(seconds[kind])}
+            row |= {"compile_seconds": building[kind].seconds, "compilations": building[kind].count}
+            row |= {"latency": latency(seconds[kind]), "work": {"frames": 1.0}}
+            if difference is not None:
+                row["difference_from_unrolled"] = difference
+            if resident:
+                given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
+                row |= busy(method, steps[kind], variables, given)
+            yield row
 
 
 def latency(seconds: np.ndarray) -> dict[str, Any]:
@@ -124,7 +144,11 @@ def latency(seconds: np.ndarray) -> dict[str, Any]:
 
 def facts(rows: list[Row]) -> dict[str, float]:
     """How much an extrapolated frame costs beside a rendered one of ``extrass``."""
-    medians = {row["name"].split(",")[0]: row["median_ms"] for row in rows if row["dtype"] == "float32"}
+    medians = {
+        row["name"].split(",")[0]: row["median_ms"]
+        for row in rows
+        if row["dtype"] == "float32" and row["implementation"] == "essjax"
+    }
     if not {"extrass SS", "extrass ESS"} <= set(medians):
         return {}
     return {"extrass: time of an ESS frame over that of an SS frame": medians["extrass ESS"] / medians["extrass SS"]}

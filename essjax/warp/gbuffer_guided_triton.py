@@ -1,0 +1,258 @@
+"""The G-buffer guided warp as one Triton kernel, for CUDA GPUs where ``jax_triton`` is installed.
+
+One thread keeps the keys of one pixel in registers, so nothing lies in memory between the guides and the image. Keys,
+network and weights are those of ``gbuffer_guided``, whose XLA version is the reference and gives the gradients
+(docs/adr/0004-top-four-in-log-space.md). Without a GPU the kernel runs in Triton's interpreter
+(``TRITON_INTERPRET=1``), which is how it is tested.
+"""
+
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import triton
+import triton.language as tl
+
+from essjax.typing import Array
+from essjax.warp import gbuffer_guided as xla
+
+BLOCK = (8, 32)
+"""Rows and columns of a program's tile: neighbours read the same candidates."""
+WARPS = 8
+
+
+@triton.jit
+def _exchange(a, b):
+    return tl.minimum(a, b), tl.maximum(a, b)
+
+
+@triton.jit
+def _sort_four(a, b, c, d):
+    a, b = _exchange(a, b)
+    c, d = _exchange(c, d)
+    a, c = _exchange(a, c)
+    b, d = _exchange(b, d)
+    b, c = _exchange(b, c)
+    return a, b, c, d
+
+
+@triton.jit
+def _merge_fours(a, b, c, d, e, f, g, h):
+    """The four smallest, sorted, of two sorted fours."""
+    a, b, c, d = tl.minimum(a, h), tl.minimum(b, g), tl.minimum(c, f), tl.minimum(d, e)
+    a, c = _exchange(a, c)
+    b, d = _exchange(b, d)
+    a, b = _exchange(a, b)
+    c, d = _exchange(c, d)
+    return a, b, c, d
+
+
+@triton.jit
+def _cost(window, here, scale_x, scale_y, x, y, column, row, stride, plane, least: tl.constexpr):
+    """Half the sum of the squares in eq 2, all scaled, of the candidate ``column``, ``row`` pixels from the centre."""
+    away_x = scale_x * (x - column)
+    away_y = scale_y * (y - row)
+    cost = least + away_x * away_x + away_y * away_y
+    for k in tl.static_range(len(here)):
+        apart = here[k] - tl.load(window + (k * plane + row * stride + column))
+        cost += apart * apart
+    return cost
+
+
+@triton.jit
+def _key(
+    window, here, scale_x, scale_y, x, y, columns: tl.constexpr, rows: tl.constexpr, number: tl.constexpr,
+    stride, plane, least: tl.constexpr,
+):  # fmt: skip
+    """Bits of a candidate's cost, the low 6 its number."""
+    cost = _cost(window, here, scale_x, scale_y, x, y, columns[number], rows[number], stride, plane, least)
+    return (cost.to(tl.int32, bitcast=True) & -64) | number
+
+
+@triton.jit
+def guided_kernel(
+    radiance, planes, guide, motion, scale, offsets, image, packed,
+    height: tl.constexpr, width: tl.constexpr, depth: tl.constexpr, channels: tl.constexpr, shared: tl.constexpr,
+    columns: tl.constexpr, rows: tl.constexpr, margin: tl.constexpr, reach: tl.constexpr, limit: tl.constexpr,
+    border: tl.constexpr, unusable: tl.constexpr, least: tl.constexpr, far: tl.constexpr,
+    block_rows: tl.constexpr, block_columns: tl.constexpr,
+):  # fmt: skip
+    """Warp one tile of one image of a batch.
+
+    Args:
+      radiance: ``[B, H, W, depth]``.
+      planes: previous guides, scaled, with a border of ``margin``: ``[B, channels, H + 2 margin, W + 2 margin]``.
+      guide: ``[B, H, W, channels]``.
+      motion: ``[B, H, W, 2]``.
+      scale: ``[B, channels + 2]``: 1 / (sqrt(2) sigma) of guides and of both directions.
+      offsets: of the candidates, int32 ``[33, 2]``.
+      image: result, as ``radiance``.
+      packed: result, int32 ``[B, H, W]``: see ``gbuffer_guided._pack``.
+      height: of the images.
+      width: of the images.
+      depth: channels of the radiance.
+      channels: of the guides.
+      shared: of the first five arrays, whether there is one for the whole batch.
+      columns: of ``offsets``, known when compiling.
+      rows: of ``offsets``.
+      margin: of ``planes``.
+      reach: largest offset.
+      limit: scaled guides beyond this match nothing.
+      border: such a guide's value.
+      unusable: costs from which on a candidate cannot be used.
+      least: added to costs.
+      far: positions are clamped to this, pixels.
+      block_rows: of a tile.
+      block_columns: of a tile.
+    """
+    stride: tl.constexpr = width + 2 * margin
+    plane: tl.constexpr = stride * (height + 2 * margin)
+    item = tl.program_id(2)
+    # What sticks out of the image repeats its last row and column: no masks.
+    row = tl.minimum(tl.program_id(1) * block_rows + tl.arange(0, block_rows), height - 1)[:, None]
+    column = tl.minimum(tl.program_id(0) * block_columns + tl.arange(0, block_columns), width - 1)[None, :]
+    pixel = row * width + column
+    if not shared[0]:
+        radiance += item * (height * width * depth)
+    if not shared[1]:
+        planes += item * (channels * plane)
+    if not shared[2]:
+        guide += item * (height * width * channels)
+    if not shared[3]:
+        motion += item * (height * width * 2)
+    if not shared[4]:
+        scale += item * (channels + 2)
+
+    to_x = column + 0.5 + tl.load(motion + 2 * pixel)
+    to_y = row + 0.5 + tl.load(motion + 2 * pixel + 1)
+    x = tl.minimum(tl.maximum(to_x, -reach - 0.5), width + reach + 0.5)
+    y = tl.minimum(tl.maximum(to_y, -reach - 0.5), height + reach + 0.5)
+    first_column, first_row = tl.floor(x), tl.floor(y)
+    window = planes + (first_row.to(tl.int32) + margin) * stride + first_column.to(tl.int32) + margin
+    x, y = x - first_column - 0.5, y - first_row - 0.5
+    scale_x, scale_y = tl.load(scale + channels), tl.load(scale + channels + 1)
+    here = ()
+    for k in tl.static_range(channels):
+        value = tl.load(guide + pixel * channels + k) * tl.load(scale + k)
+        here = here + (tl.where(tl.abs(value) < limit, value, -border),)
+
+    a = _key(window, here, scale_x, scale_y, x, y, columns, rows, 0, stride, plane, least)
+    b = _key(window, here, scale_x, scale_y, x, y, columns, rows, 1, stride, plane, least)
+    c = _key(window, here, scale_x, scale_y, x, y, columns, rows, 2, stride, plane, least)
+    d = _key(window, here, scale_x, scale_y, x, y, columns, rows, 3, stride, plane, least)
+    a, b, c, d = _sort_four(a, b, c, d)
+    for n in tl.static_range(4, len(columns) - 3, 4):
+        e = _key(window, here, scale_x, scale_y, x, y, columns, rows, n, stride, plane, least)
+        f = _key(window, here, scale_x, scale_y, x, y, columns, rows, n + 1, stride, plane, least)
+        g = _key(window, here, scale_x, scale_y, x, y, columns, rows, n + 2, stride, plane, least)
+        h = _key(window, here, scale_x, scale_y, x, y, columns, rows, n + 3, stride, plane, least)
+        e, f, g, h = _sort_four(e, f, g, h)
+        a, b, c, d = _merge_fours(a, b, c, d, e, f, g, h)
+    for n in tl.static_range(len(columns) // 4 * 4, len(columns)):
+        e = _key(window, here, scale_x, scale_y, x, y, columns, rows, n, stride, plane, least)
+        a, e = _exchange(a, e)
+        b, e = _exchange(b, e)
+        c, e = _exchange(c, e)
+        d = tl.minimum(d, e)
+
+    # The winners' costs anew, their low bits are gone. With all 33 unusable the first takes everything.
+    keys = (a, b, c, d)
+    numbers = ()
+    costs = ()
+    together = tl.zeros_like(a)
+    for rank in tl.static_range(4):
+        usable = keys[rank].to(tl.float32, bitcast=True) < unusable
+        together = together | (tl.where(usable, keys[rank] & 63, 63) << (6 * rank))
+        number = tl.where(usable, keys[rank] & 63, 0)
+        across, down = tl.load(offsets + 2 * number), tl.load(offsets + 2 * number + 1)
+        cost = _cost(window, here, scale_x, scale_y, x, y, across, down, stride, plane, 0.0)
+        costs = costs + (tl.where(usable, cost, 0.0 if rank == 0 else float("inf")),)
+        numbers = numbers + (number,)
+    lowest = tl.minimum(tl.minimum(costs[0], costs[1]), tl.minimum(costs[2], costs[3]))
+    center_column = tl.floor(tl.minimum(tl.maximum(to_x, -far), far)).to(tl.int32)
+    center_row = tl.floor(tl.minimum(tl.maximum(to_y, -far), far)).to(tl.int32)
+    weights = ()
+    winners = ()
+    total = tl.zeros_like(lowest)
+    for rank in tl.static_range(4):
+        weight = tl.exp(lowest - costs[rank])
+        total += weight
+        weights = weights + (weight,)
+        across, down = tl.load(offsets + 2 * numbers[rank]), tl.load(offsets + 2 * numbers[rank] + 1)
+        winner_column = tl.minimum(tl.maximum(center_column + across, 0), width - 1)
+        winner_row = tl.minimum(tl.maximum(center_row + down, 0), height - 1)
+        winners = winners + (winner_row * width + winner_column,)
+    at = item * (height * width) + pixel
+    for k in tl.static_range(depth):
+        value = tl.zeros_like(total)
+        for rank in tl.static_range(4):
+            value += (weights[rank] / total) * tl.load(radiance + winners[rank] * depth + k).to(tl.float32)
+        tl.store(image + at * depth + k, value)
+    tl.store(packed + at, together)
+
+
+def constants(radiance: Any, guide: Any, shared: tuple[bool, ...]) -> dict[str, Any]:
+    """What the kernel knows when it is compiled.
+
+    Args:
+      radiance: ``[B or 1, H, W, C]``.
+      guide: ``[B or 1, H, W, G]``.
+      shared: see ``guided_kernel``.
+    """
+    columns, rows = (tuple(axis) for axis in xla.candidate_offsets().T.tolist())
+    return {
+        "height": radiance.shape[1], "width": radiance.shape[2], "depth": radiance.shape[3], "channels": guide.shape[3],
+        "shared": shared, "columns": columns, "rows": rows, "margin": xla.MARGIN, "reach": max(xla.STRIDES),
+        "limit": xla.LIMIT, "border": xla.BORDER, "unusable": xla.UNUSABLE, "least": xla.LEAST, "far": xla.FAR,
+        "block_rows": BLOCK[0], "block_columns": BLOCK[1],
+    }  # fmt: skip
+
+
+def grid(height: int, width: int, batch: int) -> tuple[int, int, int]:
+    """Programs along columns, rows and images."""
+    return triton.cdiv(width, BLOCK[1]), triton.cdiv(height, BLOCK[0]), batch
+
+
+@jax.custom_batching.custom_vmap
+def guided(radiance: Array, planes: Array, guide: Array, motion: Array, scale: Array) -> list[Array]:
+    """The kernel: arguments and results of ``guided_kernel`` as arrays; leading axes are B, or 1 for all of a batch."""
+    cache = os.environ.get("TRITON_CACHE_DIR")
+    import jax_triton  # empties that variable, and torch.compile in the same process would find no cache
+
+    if cache is None:
+        os.environ.pop("TRITON_CACHE_DIR", None)
+    else:
+        os.environ["TRITON_CACHE_DIR"] = cache
+    arrays = radiance, planes, guide, motion, scale
+    batch = max(array.shape[0] for array in arrays)
+    height, width, depth = radiance.shape[1:]
+    return jax_triton.triton_call(
+        *arrays,
+        jnp.asarray(xla.candidate_offsets()),
+        kernel=guided_kernel,
+        out_shape=[
+            jax.ShapeDtypeStruct((batch, height, width, depth), radiance.dtype),
+            jax.ShapeDtypeStruct((batch, height, width), jnp.int32),
+        ],
+        grid=grid(height, width, batch),
+        num_warps=WARPS,
+        **constants(radiance, guide, tuple(array.shape[0] == 1 for array in arrays)),
+    )
+
+
+@guided.def_vmap
+def _guided_batch(size: int, batched: list[bool], *arrays: Array):
+    """A new axis in front joins the batch; what neither has stays one for all."""
+    batch = max(array.shape[int(has)] for array, has in zip(arrays, batched, strict=True))
+
+    def merge(array: Array, has: bool) -> Array:
+        inner = array.shape[int(has)]
+        if not has and inner == 1:
+            return array
+        array = array if has else array[None]
+        array = jnp.broadcast_to(array, (size, batch, *array.shape[2:]))
+        return array.reshape(size * batch, *array.shape[2:])
+
+    outputs = guided(*(merge(array, has) for array, has in zip(arrays, batched, strict=True)))
+    return [output.reshape(size, batch, *output.shape[1:]) for output in outputs], [True, True]
