@@ -56,6 +56,13 @@ def color_along(world: World, x: Array, y: Array, angle: Array) -> Float[Array, 
     return stack(radiance(world, origin, direction, angle))
 
 
+@jax.jit
+def average_color(world: World, x: Array, y: Array, offsets: Array, angle: Array) -> Float[Array, "N 3"]:
+    """Mean of ``color_along`` over ``offsets`` ``[S, 2]`` around each screen position."""
+    places = [(v[None] + offsets[:, k, None]).ravel() for k, v in enumerate((x, y))]
+    return color_along(world, *places, angle).reshape(len(offsets), x.size, 3).mean(axis=0)
+
+
 def _follow(previous: World, s: Surface, direction: Vec) -> tuple[Vec, Vec, Array]:
     """Ray of the previous frame towards the same material point (sky: direction), and its length."""
     _, eye = _camera(previous)
@@ -158,17 +165,14 @@ def chunk_size() -> int:
     return CPU_CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
 
 
-def _workers() -> int:
-    return min(os.cpu_count() or 1, 16) if jax.default_backend() == "cpu" else 1
-
-
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_workers(), thread_name_prefix="essjax-render")
+    return ThreadPoolExecutor(min(os.cpu_count() or 1, 16), thread_name_prefix="essjax-render")
 
 
+@functools.lru_cache(8)
 def tile_order(width: int, height: int, tile: int) -> np.ndarray:
-    """Indices of all pixels, tile by tile: rays that are traced together should lie together."""
+    """Indices of all pixels, tile by tile: rays that are traced together should lie together. Shared: do not write."""
     y, x = np.divmod(np.arange(width * height), width)
     return np.lexsort((x, y, x // tile, y // tile))
 
@@ -194,9 +198,12 @@ def in_tiles(
     order = tile_order(width, height, max(1, int(size**0.5)))
     pieces = -(-order.size // size)
     padded = np.pad(order, (0, pieces * size - order.size), mode="edge").reshape(pieces, size)
-    run = lambda part: jax.device_get(function(x[part], y[part]))
-    results = [run(padded[0])]  # alone: threads that meet an uncompiled function would each compile it
-    results += _threads().map(run, padded[1:])
+    if jax.default_backend() == "cpu":
+        run = lambda part: jax.device_get(function(x[part], y[part]))
+        results = [run(padded[0])]  # alone: threads that meet an uncompiled function would each compile it
+        results += _threads().map(run, padded[1:])
+    else:  # all calls are queued before the first result is waited for
+        results = jax.device_get([function(x[part], y[part]) for part in padded])
     images = {}
     for name in results[0]:
         flat = np.concatenate([result[name] for result in results])[: order.size]
@@ -220,15 +227,12 @@ def _spread(x: np.ndarray, y: np.ndarray, offsets: np.ndarray, rays: int) -> tup
 def render_reference(world: World, width: int, height: int, *, spp: int = 64) -> np.ndarray:
     """Anti-aliased image ``[H, W, 3]``: ``spp`` samples per pixel, box filter."""
     world = jax.device_put(world)
-    offsets = (reference_samples(spp) - 0.5) / width
+    offsets = ((reference_samples(spp) - 0.5) / width).astype(np.float32)
     angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
-
-    def average(x, y):
-        color = color_along(world, *_spread(x, y, offsets, rays), angle)
-        return {"color": color[: x.size * spp].reshape(spp, x.size, 3).mean(axis=0)}
-
     x, y = screen_grid(width, height, np.zeros(2))
-    return in_tiles(average, x, y, width, height, rays=rays, samples=spp)["color"]
+    return in_tiles(
+        lambda a, b: {"color": average_color(world, a, b, offsets, angle)}, x, y, width, height, rays=rays, samples=spp
+    )["color"]
 
 
 def render_buffers(

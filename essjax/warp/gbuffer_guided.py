@@ -228,8 +228,10 @@ def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array,
     from essjax.warp.gbuffer_guided_triton import guided  # an optional package
 
     scale = jnp.sqrt(0.5 * inverse)
-    pad = ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN))
-    planes = jnp.pad(jnp.stack(_scaled(guide_previous, scale, BORDER)), pad, constant_values=BORDER)
+    planes = _scaled(guide_previous, scale, BORDER)
+    planes += [jnp.zeros_like(planes[0])] * (len(planes) % 2)
+    pairs = jnp.stack([jnp.stack(planes[k : k + 2], axis=-1) for k in range(0, len(planes), 2)])
+    planes = jnp.pad(pairs, [(0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)], constant_values=BORDER)
     return [array[0] for array in guided(*(array[None] for array in (radiance, planes, guide, motion, scale)))]
 
 

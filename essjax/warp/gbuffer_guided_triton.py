@@ -54,19 +54,21 @@ def _cost(window, here, scale_x, scale_y, x, y, column, row, stride, plane, leas
     away_x = scale_x * (x - column)
     away_y = scale_y * (y - row)
     cost = least + away_x * away_x + away_y * away_y
-    for k in tl.static_range(len(here)):
-        apart = here[k] - tl.load(window + (k * plane + row * stride + column))
-        cost += apart * apart
+    at = window + (row * stride + column)
+    for k in tl.static_range(len(here) // 2):
+        pair = tl.load(at + k * plane)  # two channels by one load
+        first = here[2 * k] - pair.to(tl.int32).to(tl.float32, bitcast=True)
+        second = here[2 * k + 1] - (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+        cost += first * first
+        cost += second * second
     return cost
 
 
 @triton.jit
-def _key(
-    window, here, scale_x, scale_y, x, y, columns: tl.constexpr, rows: tl.constexpr, number: tl.constexpr,
-    stride, plane, least: tl.constexpr,
-):  # fmt: skip
+def _key(window, here, scale_x, scale_y, x, y, offsets, number, stride, plane, least: tl.constexpr):
     """Bits of a candidate's cost, the low 6 its number."""
-    cost = _cost(window, here, scale_x, scale_y, x, y, columns[number], rows[number], stride, plane, least)
+    column, row = tl.load(offsets + 2 * number), tl.load(offsets + 2 * number + 1)
+    cost = _cost(window, here, scale_x, scale_y, x, y, column, row, stride, plane, least)
     return (cost.to(tl.int32, bitcast=True) & -64) | number
 
 
@@ -74,7 +76,7 @@ def _key(
 def guided_kernel(
     radiance, planes, guide, motion, scale, offsets, image, packed,
     height: tl.constexpr, width: tl.constexpr, depth: tl.constexpr, channels: tl.constexpr, shared: tl.constexpr,
-    columns: tl.constexpr, rows: tl.constexpr, margin: tl.constexpr, reach: tl.constexpr, limit: tl.constexpr,
+    count: tl.constexpr, margin: tl.constexpr, reach: tl.constexpr, limit: tl.constexpr,
     border: tl.constexpr, unusable: tl.constexpr, least: tl.constexpr, far: tl.constexpr,
     block_rows: tl.constexpr, block_columns: tl.constexpr,
 ):  # fmt: skip
@@ -82,7 +84,8 @@ def guided_kernel(
 
     Args:
       radiance: ``[B, H, W, depth]``.
-      planes: previous guides, scaled, with a border of ``margin``: ``[B, channels, H + 2 margin, W + 2 margin]``.
+      planes: previous guides, scaled, two by two (an odd one beside zeros), with a border of ``margin``:
+        ``[B, ceil(channels / 2), H + 2 margin, W + 2 margin, 2]``.
       guide: ``[B, H, W, channels]``.
       motion: ``[B, H, W, 2]``.
       scale: ``[B, channels + 2]``: 1 / (sqrt(2) sigma) of guides and of both directions.
@@ -94,8 +97,7 @@ def guided_kernel(
       depth: channels of the radiance.
       channels: of the guides.
       shared: of the first five arrays, whether there is one for the whole batch.
-      columns: of ``offsets``, known when compiling.
-      rows: of ``offsets``.
+      count: of candidates.
       margin: of ``planes``.
       reach: largest offset.
       limit: scaled guides beyond this match nothing.
@@ -116,7 +118,7 @@ def guided_kernel(
     if not shared[0]:
         radiance += item * (height * width * depth)
     if not shared[1]:
-        planes += item * (channels * plane)
+        planes += item * ((channels + 1) // 2 * 2 * plane)
     if not shared[2]:
         guide += item * (height * width * channels)
     if not shared[3]:
@@ -129,28 +131,30 @@ def guided_kernel(
     x = tl.minimum(tl.maximum(to_x, -reach - 0.5), width + reach + 0.5)
     y = tl.minimum(tl.maximum(to_y, -reach - 0.5), height + reach + 0.5)
     first_column, first_row = tl.floor(x), tl.floor(y)
-    window = planes + (first_row.to(tl.int32) + margin) * stride + first_column.to(tl.int32) + margin
+    window = planes.to(tl.pointer_type(tl.int64)) + (first_row.to(tl.int32) + margin) * stride + first_column.to(tl.int32) + margin
     x, y = x - first_column - 0.5, y - first_row - 0.5
     scale_x, scale_y = tl.load(scale + channels), tl.load(scale + channels + 1)
     here = ()
     for k in tl.static_range(channels):
         value = tl.load(guide + pixel * channels + k) * tl.load(scale + k)
         here = here + (tl.where(tl.abs(value) < limit, value, -border),)
+    if channels % 2:
+        here = here + (tl.zeros_like(x),)
 
-    a = _key(window, here, scale_x, scale_y, x, y, columns, rows, 0, stride, plane, least)
-    b = _key(window, here, scale_x, scale_y, x, y, columns, rows, 1, stride, plane, least)
-    c = _key(window, here, scale_x, scale_y, x, y, columns, rows, 2, stride, plane, least)
-    d = _key(window, here, scale_x, scale_y, x, y, columns, rows, 3, stride, plane, least)
+    a = _key(window, here, scale_x, scale_y, x, y, offsets, 0, stride, plane, least)
+    b = _key(window, here, scale_x, scale_y, x, y, offsets, 1, stride, plane, least)
+    c = _key(window, here, scale_x, scale_y, x, y, offsets, 2, stride, plane, least)
+    d = _key(window, here, scale_x, scale_y, x, y, offsets, 3, stride, plane, least)
     a, b, c, d = _sort_four(a, b, c, d)
-    for n in tl.static_range(4, len(columns) - 3, 4):
-        e = _key(window, here, scale_x, scale_y, x, y, columns, rows, n, stride, plane, least)
-        f = _key(window, here, scale_x, scale_y, x, y, columns, rows, n + 1, stride, plane, least)
-        g = _key(window, here, scale_x, scale_y, x, y, columns, rows, n + 2, stride, plane, least)
-        h = _key(window, here, scale_x, scale_y, x, y, columns, rows, n + 3, stride, plane, least)
+    for n in tl.range(4, count // 4 * 4, 4):
+        e = _key(window, here, scale_x, scale_y, x, y, offsets, n, stride, plane, least)
+        f = _key(window, here, scale_x, scale_y, x, y, offsets, n + 1, stride, plane, least)
+        g = _key(window, here, scale_x, scale_y, x, y, offsets, n + 2, stride, plane, least)
+        h = _key(window, here, scale_x, scale_y, x, y, offsets, n + 3, stride, plane, least)
         e, f, g, h = _sort_four(e, f, g, h)
         a, b, c, d = _merge_fours(a, b, c, d, e, f, g, h)
-    for n in tl.static_range(len(columns) // 4 * 4, len(columns)):
-        e = _key(window, here, scale_x, scale_y, x, y, columns, rows, n, stride, plane, least)
+    for n in tl.static_range(count // 4 * 4, count):
+        e = _key(window, here, scale_x, scale_y, x, y, offsets, n, stride, plane, least)
         a, e = _exchange(a, e)
         b, e = _exchange(b, e)
         c, e = _exchange(c, e)
@@ -200,10 +204,9 @@ def constants(radiance: Any, guide: Any, shared: tuple[bool, ...]) -> dict[str, 
       guide: ``[B or 1, H, W, G]``.
       shared: see ``guided_kernel``.
     """
-    columns, rows = (tuple(axis) for axis in xla.candidate_offsets().T.tolist())
     return {
         "height": radiance.shape[1], "width": radiance.shape[2], "depth": radiance.shape[3], "channels": guide.shape[3],
-        "shared": shared, "columns": columns, "rows": rows, "margin": xla.MARGIN, "reach": max(xla.STRIDES),
+        "shared": shared, "count": len(xla.candidate_offsets()), "margin": xla.MARGIN, "reach": max(xla.STRIDES),
         "limit": xla.LIMIT, "border": xla.BORDER, "unusable": xla.UNUSABLE, "least": xla.LEAST, "far": xla.FAR,
         "block_rows": BLOCK[0], "block_columns": BLOCK[1],
     }  # fmt: skip
