@@ -325,13 +325,13 @@ def background(gbuffers: GBuffers) -> jax.Array:
     return ~jnp.isfinite(gbuffers.depth)
 
 
-_DEPTH_SAMPLES = 64
+_DEPTH_SAMPLES = 32
 
 
 def depth_scale(gbuffers: GBuffers) -> Scalar:
     """Median finite depth ``[...]`` of each image (1 if there is none), the unit of ``network_depth``.
 
-    Of every k-th row and column such that about 64 x 64 pixels are left: a sort of all would cost as much as a small
+    Of every k-th row and column such that about 32 x 32 pixels are left: a sort of all would cost as much as a small
     network, and every frame computes it, as any frame may follow a cut.
     """
     height, width = gbuffers.depth.shape[-3:-1]

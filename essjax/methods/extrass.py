@@ -26,8 +26,9 @@ from essjax.methods.rendered import (
     Memory,
     advance,
     guided_extrapolation,
+    hole_buffers,
     push_pair,
-    reset_memory,
+    reset_pair,
     start_pair,
 )
 from essjax.networks import extrassnet, frnet
@@ -66,9 +67,9 @@ def extrass_w(
         return _store(history, frame), Prediction(image=rendered_color(frame, info.name))
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history = advance(reset_memory(frame.cut, start_pair(frame), history), frame)
-        newest = select_time(history.frames, 0)
-        image = guided_extrapolation(newest, frame, sigma_guide=sigma_guide, sigma_distance=sigma_distance)
+        history = advance(reset_pair(frame, history), frame)
+        newest, sigmas = select_time(history.frames, 0), {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
+        image = guided_extrapolation(newest, history.count, frame, **sigmas)
         return history, Prediction(image=image, aux={"warp": image})
 
     info = MethodInfo("extrass-w", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
@@ -76,7 +77,7 @@ def extrass_w(
 
 
 def _store(history: Memory, frame: Frame) -> Memory:
-    return push_pair(advance(reset_memory(frame.cut, start_pair(frame), history), frame), frame)
+    return push_pair(advance(reset_pair(frame, history), frame), frame)
 
 
 def halve(image: Image) -> Image:
@@ -150,7 +151,7 @@ class Extrapolated:
 
 def _extrapolate(network: Network, variables: PyTree, pair: Memory, frame: Frame, sigmas: dict) -> Extrapolated:
     # Rendered frames carry no parameters: without stop_gradient the warps' backward pass would be computed for nothing.
-    warped = jax.lax.stop_gradient(guided_extrapolation(pair.frames, frame, **sigmas))
+    warped = jax.lax.stop_gradient(guided_extrapolation(pair.frames, pair.count, frame, **sigmas))
     refined = refine(network, variables, warped, frame.gbuffers)
     return Extrapolated(warp=warped[0], **refined)
 
@@ -186,7 +187,7 @@ def extrass_e(
         return _store(history, frame), Prediction(image=rendered_color(frame, info.name))
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history = advance(reset_memory(frame.cut, start_pair(frame), history), frame)
+        history = advance(reset_pair(frame, history), frame)
         result = _extrapolate(network, variables["frnet"], history, frame, sigmas)
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
@@ -201,7 +202,7 @@ class History:
     Attributes:
       rendered: the two latest rendered LR frames.
       image: last HR output, linear, ``[..., sH, sW, 3]``.
-      gbuffers: of the last frame, rendered or not.
+      gbuffers: of the last frame, rendered or not: those that marking holes needs.
       jitter: of the last frame.
       depth_scale: unit of depth, ``[...]``.
       empty: bool ``[...]``: no output yet since the cut.
@@ -310,7 +311,7 @@ def extrass(
         return History(
             rendered=start_pair(example),
             image=image,
-            gbuffers=jax.tree.map(jnp.copy, example.gbuffers),  # a streaming step donates its history
+            gbuffers=jax.tree.map(jnp.copy, hole_buffers(example.gbuffers)),  # a streaming step donates its history
             jitter=jnp.copy(example.jitter),
             depth_scale=depth_scale(example.gbuffers),
             empty=jnp.ones(example.cut.shape, bool),
@@ -318,7 +319,7 @@ def extrass(
 
     def reset(frame: Frame, history: History) -> History:
         fresh = start(frame)
-        rendered = reset_memory(frame.cut, fresh.rendered, history.rendered)
+        rendered = reset_pair(frame, history.rendered)
         rest = reset_at_cut(
             frame.cut, dataclasses.replace(fresh, rendered=None), dataclasses.replace(history, rendered=None)
         )
@@ -363,7 +364,7 @@ def extrass(
             history,
             rendered=rendered,
             image=image,
-            gbuffers=frame.gbuffers,
+            gbuffers=hole_buffers(frame.gbuffers),
             jitter=frame.jitter,
             empty=jnp.zeros_like(history.empty),
         )

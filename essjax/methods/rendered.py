@@ -151,12 +151,33 @@ def push_pair(memory: Memory, frame: Frame) -> Memory:
     return push(memory, frame, _shading(frame))
 
 
+def reset_pair(frame: Frame, memory: Memory) -> Memory:
+    """``memory`` of nothing where ``frame`` follows a cut.
+
+    What it has kept stays where it is, unread while ``count`` is 0: choosing would copy it in every frame.
+    """
+    fresh = start_pair(frame)
+    kept = reset_memory(frame.cut, _without_content(fresh), _without_content(memory))
+    return dataclasses.replace(kept, frames=dataclasses.replace(kept.frames, content=memory.frames.content))
+
+
+def _without_content(memory: Memory) -> Memory:
+    return dataclasses.replace(memory, frames=dataclasses.replace(memory.frames, content=None))
+
+
 def guided_extrapolation(
-    rendered: Rendered, frame: Frame, *, sigma_guide: float | tuple[float, ...], sigma_distance: float
+    rendered: Rendered, count: Array, frame: Frame, *, sigma_guide: float | tuple[float, ...], sigma_distance: float
 ) -> Color:
     """f_g: rendered frames warped to ``frame``'s samples, ``[2, ..., H, W, 3]`` (or without that axis; eq 1-3).
 
-    Shading is warped and modulated with the *current* base colour (section 4.2).
+    Shading is warped and modulated with the *current* base colour (section 4.2). Black where nothing was rendered yet.
+
+    Args:
+      rendered: one frame or more of a ``Memory``.
+      count: of that memory.
+      frame: the current one, its colour unread.
+      sigma_guide: see ``gbuffer_guided_warp``.
+      sigma_distance: see ``gbuffer_guided_warp``.
     """
     like = rendered.motion.shape[: -frame.motion.ndim]  # (2,) or ()
 
@@ -171,4 +192,5 @@ def guided_extrapolation(
         sigma_guide=sigma_guide,
         sigma_distance=sigma_distance,
     )
+    shading = jnp.where(expand_flag(count > 0, frame.motion.ndim), shading, 0.0)
     return modulate(shading, albedo(frame.gbuffers))

@@ -3,7 +3,7 @@
 XLA:CPU lays out the gradients of a convolution in a loop such that they miss its fast routine and run about 20 times
 slower (docs/adr/0006-scan-friendly-convolution.md). Written out as plain NHWC convolutions they do not. The gradient of
 a strided one is that of a stride-1 convolution of blocks, a depthwise one is a sum of shifted products. On other
-backends the ordinary convolution is used.
+backends the ordinary convolution is used, with channels in the multiples that GPUs like, or a kernel of our own.
 """
 
 from functools import partial
@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from essjax.networks.precision import in_compute_dtype
+from essjax import kernels
+from essjax.networks.precision import current_itemsize, in_compute_dtype
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
 Padding = tuple[tuple[int, int], ...]
@@ -132,6 +133,57 @@ def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation
             if depthwise:
                 return _depthwise(lhs, rhs, pairs)
             return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _strided(lhs, rhs, strides[0], pairs)
-    return lax.conv_general_dilated(
+    outputs = rhs.shape[3]
+    if groups == 1 and jax.default_backend() == "gpu":
+        lhs, rhs = pad_channels(lhs), _pad_kernel(rhs)
+    result = lax.conv_general_dilated(
         lhs, rhs, window_strides, padding, lhs_dilation=lhs_dilation, rhs_dilation=rhs_dilation, **options
     )
+    return result[..., :outputs]
+
+
+LIKED = 8
+"""Channels come in multiples of this where a GPU multiplies 16-bit numbers: 16 bytes, one access."""
+
+
+def pad_channels(x: jax.Array) -> jax.Array:
+    """16-bit images with zeros behind their channels up to a multiple of ``LIKED``; others unchanged.
+
+    cuDNN pads by passes of its own; written out, XLA joins it with what makes the image.
+    """
+    if x.dtype.itemsize != 2 or x.shape[-1] % LIKED == 0:
+        return x
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -x.shape[-1] % LIKED)])
+
+
+def _pad_kernel(kernel: jax.Array) -> jax.Array:
+    """Zeros for the channels that ``pad_channels`` adds, and outputs up to such a multiple."""
+    if kernel.dtype.itemsize != 2:
+        return kernel
+    return jnp.pad(kernel, [(0, 0), (0, 0), *((0, -n % LIKED) for n in kernel.shape[2:])])
+
+
+def fits_kernel(channels: int, outputs: int) -> bool:
+    """Whether the Triton kernel for 3x3 convolutions is faster than cuDNN: 16-bit numbers, few channels, a GPU.
+
+    Measured on an H100 (docs/guides/performance.md): with 48 inputs it is just as fast, activation aside.
+    """
+    return kernels.available() and current_itemsize() == 2 and channels <= 48 and outputs <= 32
+
+
+@in_compute_dtype
+def convolve_leaky(x: jax.Array, kernel: jax.Array, bias: jax.Array, slope: float) -> jax.Array:
+    """Leaky ReLU of a 3x3 convolution with zero padding by one kernel; ask ``fits_kernel`` first.
+
+    Args:
+      x: ``[..., H, W, I]``.
+      kernel: ``[3, 3, I, O]``.
+      bias: ``[O]``.
+      slope: of the leaky ReLU; 1 for none.
+    """
+    from essjax.networks.convolution_triton import convolve  # an optional package
+
+    images = pad_channels(x).reshape(-1, *x.shape[-3:-1], x.shape[-1] + -x.shape[-1] % LIKED)
+    kernel = jnp.pad(kernel, [(0, 0), (0, 0), (0, images.shape[-1] - kernel.shape[2]), (0, 0)])
+    result = convolve(images, kernel, bias.astype(jnp.float32), slope)
+    return result.reshape(*x.shape[:-1], kernel.shape[3])

@@ -38,6 +38,11 @@ def compute_dtype(name: str) -> Iterator[None]:
         _current.reset(token)
 
 
+def current_itemsize() -> int:
+    """Bytes of a number of the compute type."""
+    return jnp.dtype(_current.get()).itemsize
+
+
 def in_compute_dtype(product: Callable) -> Callable:
     """``product`` of two operands that are rounded to the compute type; its result has the first one's type again."""
 

@@ -9,12 +9,12 @@ part that gradients see.
 """
 
 import functools
-import importlib.util
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax import kernels
 from essjax.frames import GBuffers, surface_guides
 from essjax.typing import Array, Image, Motion
 from essjax.warp._batch import check_channels, over_leading_axes
@@ -179,7 +179,7 @@ def _select(implementation: str, *arrays: Array) -> Array:
 
 
 def _weigh(
-    guide_previous: Array, guide: Array, motion: Array, inverse: Array, packed: Array
+    packed: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array
 ) -> tuple[Array, tuple[Array, ...]]:
     """Weights ``[4, H, W]`` and pixel numbers, four of ``[H, W]``, of the winners; all that gradients pass through."""
     height, width, channels = guide.shape
@@ -204,8 +204,9 @@ def _weigh(
     return jax.lax.optimization_barrier(weights), tuple(row * width + column for _, column, row in winners)
 
 
-def _blend(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array, packed: Array) -> Array:
-    weights, pixels = _weigh(guide_previous, guide, motion, inverse, packed)
+def _blend(packed: Array, radiance: Array, *arrays: Array) -> Array:
+    """The image from packed winners and all that gradients pass through."""
+    weights, pixels = _weigh(packed, *arrays)
     flat = radiance.reshape(-1, radiance.shape[-1])
     values = [gather_pixels(flat, pixel).astype(jnp.float32) for pixel in pixels]
     total = sum(weight[..., None] * value for weight, value in zip(weights, values, strict=True))
@@ -220,7 +221,7 @@ def _warp_by_kernel(radiance: Array, guide_previous: Array, guide: Array, motion
 @_warp_by_kernel.defjvp
 def _derivative(primals, tangents):
     image, packed = _kernel(*primals)
-    return image, jax.jvp(lambda *arrays: _blend(*arrays, packed), primals, tangents)[1]
+    return image, jax.jvp(functools.partial(_blend, packed), primals, tangents)[1]
 
 
 def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> list[Array]:
@@ -243,13 +244,12 @@ def _chosen(implementation: str, known: tuple[str, ...] = IMPLEMENTATIONS) -> st
     """
     if implementation not in known:
         raise ValueError(f"implementation: expected one of {', '.join(known)}, got {implementation!r}.")
-    runs = jax.default_backend() == "gpu" and importlib.util.find_spec("jax_triton") is not None
-    if implementation == "triton" and not runs:
+    if implementation == "triton" and not kernels.available():
         raise ValueError(
             f"implementation: 'triton' needs a GPU and the package jax-triton, and JAX runs on "
             f"{jax.default_backend()}. Install essjax[gpu], or leave the choice to 'auto'."
         )
-    return ("triton" if runs else "network") if implementation == "auto" else implementation
+    return ("triton" if kernels.available() else "network") if implementation == "auto" else implementation
 
 
 def _inverse_variances(sigma_guide, sigma_distance, channels: int) -> Array:
@@ -319,7 +319,7 @@ def gbuffer_guided_warp(
     def warp(radiance, *arrays):
         if chosen == "triton":
             return _warp_by_kernel(radiance, *arrays)
-        return _blend(radiance, *arrays, _select(chosen, *jax.lax.stop_gradient(arrays)))
+        return _blend(_select(chosen, *jax.lax.stop_gradient(arrays)), radiance, *arrays)
 
     return _run(warp, (radiance,), guide_previous, guide, motion, sigma_guide, sigma_distance)
 
@@ -342,7 +342,7 @@ def guided_weights(
     chosen = _chosen(implementation, SELECTIONS)
 
     def weigh(*arrays):
-        return _weigh(*arrays, _select(chosen, *jax.lax.stop_gradient(arrays)))
+        return _weigh(_select(chosen, *jax.lax.stop_gradient(arrays)), *arrays)
 
     weights, pixels = _run(weigh, (), guide_previous, guide, motion, sigma_guide, sigma_distance)
     return jnp.moveaxis(weights, -3, -1), jnp.stack(pixels, axis=-1)

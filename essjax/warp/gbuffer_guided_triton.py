@@ -6,7 +6,6 @@ network and weights are those of ``gbuffer_guided``, whose XLA version is the re
 (``TRITON_INTERPRET=1``), which is how it is tested.
 """
 
-import os
 from typing import Any
 
 import jax
@@ -14,12 +13,13 @@ import jax.numpy as jnp
 import triton
 import triton.language as tl
 
+from essjax import kernels
 from essjax.typing import Array
 from essjax.warp import gbuffer_guided as xla
 
-BLOCK = (8, 32)
-"""Rows and columns of a program's tile: neighbours read the same candidates."""
-WARPS = 8
+BLOCK = (1, 128)
+"""Rows and columns of a program's tile."""
+WARPS = 4
 
 
 @triton.jit
@@ -131,7 +131,12 @@ def guided_kernel(
     x = tl.minimum(tl.maximum(to_x, -reach - 0.5), width + reach + 0.5)
     y = tl.minimum(tl.maximum(to_y, -reach - 0.5), height + reach + 0.5)
     first_column, first_row = tl.floor(x), tl.floor(y)
-    window = planes.to(tl.pointer_type(tl.int64)) + (first_row.to(tl.int32) + margin) * stride + first_column.to(tl.int32) + margin
+    window = (
+        planes.to(tl.pointer_type(tl.int64))
+        + (first_row.to(tl.int32) + margin) * stride
+        + first_column.to(tl.int32)
+        + margin
+    )
     x, y = x - first_column - 0.5, y - first_row - 0.5
     scale_x, scale_y = tl.load(scale + channels), tl.load(scale + channels + 1)
     here = ()
@@ -220,20 +225,13 @@ def grid(height: int, width: int, batch: int) -> tuple[int, int, int]:
 @jax.custom_batching.custom_vmap
 def guided(radiance: Array, planes: Array, guide: Array, motion: Array, scale: Array) -> list[Array]:
     """The kernel: arguments and results of ``guided_kernel`` as arrays; leading axes are B, or 1 for all of a batch."""
-    cache = os.environ.get("TRITON_CACHE_DIR")
-    import jax_triton  # empties that variable, and torch.compile in the same process would find no cache
-
-    if cache is None:
-        os.environ.pop("TRITON_CACHE_DIR", None)
-    else:
-        os.environ["TRITON_CACHE_DIR"] = cache
     arrays = radiance, planes, guide, motion, scale
     batch = max(array.shape[0] for array in arrays)
     height, width, depth = radiance.shape[1:]
-    return jax_triton.triton_call(
+    return kernels.call(
+        guided_kernel,
         *arrays,
         jnp.asarray(xla.candidate_offsets()),
-        kernel=guided_kernel,
         out_shape=[
             jax.ShapeDtypeStruct((batch, height, width, depth), radiance.dtype),
             jax.ShapeDtypeStruct((batch, height, width), jnp.int32),

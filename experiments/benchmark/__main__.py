@@ -11,6 +11,8 @@ from typing import Any
 from rich.console import Console
 
 SUITES = ("warp", "networks", "pipeline", "train", "scenes")
+SIZE = "960x540"
+"""Results of other sizes have theirs in the file's name."""
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -20,12 +22,13 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--suite", nargs="+", default=list(SUITES), metavar="NAME", help=f"of {', '.join(SUITES)}")
     parser.add_argument("--device", help="cpu or gpu (default: JAX's choice)")
-    parser.add_argument("--size", default="960x540", metavar="WxH", help="of low-resolution frames (default: 960x540)")
+    parser.add_argument("--size", default=SIZE, metavar="WxH", help=f"of low-resolution frames (default: {SIZE})")
     parser.add_argument("--repetitions", type=int, default=20, help="of each case (default: 20)")
     parser.add_argument("--frames", type=int, default=300, help="streamed by the pipeline suite (default: 300)")
     parser.add_argument(
         "--dtypes", nargs="+", default=["float32", "bfloat16"], help="of networks (default: float32 bfloat16)"
     )
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="cases that begin so, for example: extrass guided")
     parser.add_argument("--no-peers", action="store_true", help="only essjax, even where PyTorch is installed")
     parser.add_argument("--out", metavar="DIR", type=Path, help="where results go (default: experiments/results)")
     return parser.parse_args(arguments)
@@ -74,18 +77,14 @@ def _benchmark(options: argparse.Namespace, console: Console) -> int:
     from experiments.experiment import write_json
 
     settings = suites.Options(
-        width, height, options.repetitions, options.frames, not options.no_peers, tuple(options.dtypes)
-    )
+        width, height, options.repetitions, options.frames, not options.no_peers, tuple(options.dtypes),
+        tuple(options.only or ()),
+    )  # fmt: skip
     out, load_average = options.out or RESULTS, os.getloadavg()[0]
     out.mkdir(parents=True, exist_ok=True)
     limits = machine.roofline(options.repetitions)
     for name in options.suite:
-        suite, rows = suites.load()[name], []
-        for row in suite.rows(settings):
-            if "flops" in row:
-                row["roofline_fraction"] = machine.roofline_fraction(row, limits, row.get("dtype", "float32"))
-            rows.append(row)
-            _print(row, console)
+        suite = suites.load()[name]
         result: dict[str, Any] = {
             "schema": 1,
             "kind": "benchmark",
@@ -93,12 +92,24 @@ def _benchmark(options: argparse.Namespace, console: Console) -> int:
             "environment": {**environment("torch"), "date": datetime.datetime.now(datetime.UTC).date().isoformat()},
             "machine": {**limits, "load_at_start": load_average},
             "settings": {"size": [width, height], "repetitions": options.repetitions, "frames": options.frames},
-            "rows": rows,
-            "facts": {fact: float(value) for fact, value in suite.facts(rows).items()},
+            "rows": [],
+            "facts": {},
         }
+        size = "" if options.size == SIZE else f"-{options.size}"
+        path = out / f"benchmark-{name}-{jax.default_backend()}-jax-{jax.__version__}{size}.json"
+        partial = path.with_suffix(".partial")  # what a run that breaks off has measured
+        for row in suite.rows(settings):
+            if "flops" in row:
+                row["roofline_fraction"] = machine.roofline_fraction(row, limits, row.get("dtype", "float32"))
+            result["rows"].append(row)
+            write_json(partial, result)
+            _print(row, console)
+        if not result["rows"]:
+            raise ValueError(f"--only {' '.join(options.only)}: no case of the suite {name} begins so.")
+        result["facts"] = {fact: float(value) for fact, value in suite.facts(result["rows"]).items()}
         schema.check(result)
-        path = out / f"benchmark-{name}-{jax.default_backend()}-jax-{jax.__version__}.json"
         write_json(path, result)
+        partial.unlink()
         for fact, value in result["facts"].items():
             console.print(f"{fact}: {value:.3g}", soft_wrap=True)
         console.print(f"{name}: {path}", soft_wrap=True)

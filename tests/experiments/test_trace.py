@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments.trace import describe, operations
+from experiments.trace import describe, device_milliseconds, operations
 
 
 def _write(folder, events):
@@ -35,6 +35,21 @@ def test_a_trace_of_jax(tmp_path):
     with jax.profiler.trace(str(tmp_path)):
         function(x).block_until_ready()
     assert any("sort" in operation.name and operation.milliseconds > 0 for operation in operations(tmp_path))
+
+
+def test_the_time_that_a_gpu_is_busy(tmp_path):
+    """Streams side by side count once, the host's threads and another device not at all."""
+    named = [(1, 0, "/device:GPU:0"), (2, 0, "/host:CPU")]
+    threads = [(1, 5, "Stream #5(Compute)"), (1, 6, "Stream #6(Memcpy)"), (1, 7, "Steps"), (2, 5, "Stream #5")]
+    events = [{"ph": "M", "name": "process_name", "pid": p, "args": {"name": name}} for p, _, name in named]
+    events += [{"ph": "M", "name": "thread_name", "pid": p, "tid": t, "args": {"name": n}} for p, t, n in threads]
+    spans = [(1, 5, 0, 1000), (1, 6, 500, 1000), (1, 5, 3000, 500), (1, 7, 0, 9000), (2, 5, 0, 9000)]
+    events += [{"ph": "X", "pid": p, "tid": t, "ts": ts, "dur": dur} for p, t, ts, dur in spans]
+    _write(tmp_path, events)
+    assert device_milliseconds(tmp_path) == pytest.approx(2.0)
+    _write(tmp_path, events[:-5])
+    with pytest.raises(ValueError, match="expected work on a stream of a GPU, found none"):
+        device_milliseconds(tmp_path)
 
 
 def test_no_trace_and_an_empty_one(tmp_path):

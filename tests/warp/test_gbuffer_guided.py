@@ -281,7 +281,13 @@ def test_errors_name_the_argument():
         gbuffer_guided_warp(radiance, guide_previous, guide, motion, sigma_guide=(0.1, 0.2))
     with pytest.raises(ValueError, match=r"guide_previous: expected \[..., 13, 18, 6\], got \(13, 18, 3\)"):
         gbuffer_guided_warp(radiance, guide_previous[..., :3], guide, motion)
-    with pytest.raises(ValueError, match=r"implementation: expected one of network, reference, got 'triton'"):
+    with pytest.raises(ValueError, match=r"expected one of auto, network, reference, triton, got 'fast'"):
+        gbuffer_guided_warp(radiance, guide_previous, guide, motion, implementation="fast")
+    with pytest.raises(ValueError, match=r"expected one of network, reference, got 'triton'"):
+        guided_weights(guide_previous, guide, motion, implementation="triton")
+    with pytest.raises(
+        ValueError, match=r"'triton' needs a GPU and the package jax-triton, and JAX runs on cpu. Install"
+    ):
         gbuffer_guided_warp(radiance, guide_previous, guide, motion, implementation="triton")
     with pytest.raises(ValueError, match=r"radiance: expected \[..., 13, 18, C\], got \(12, 18, 3\)"):
         gbuffer_guided_warp(radiance[1:], guide_previous, guide, motion)

@@ -18,6 +18,7 @@ class Options(NamedTuple):
       frames: that are streamed for the histogram of latencies.
       peers: also time other frameworks' versions, where they are installed.
       dtypes: the networks' compute types.
+      only: beginnings of the names of cases that are run; all when empty. The train and scenes suites take no notice.
     """
 
     width: int = 960
@@ -26,6 +27,11 @@ class Options(NamedTuple):
     frames: int = 300
     peers: bool = True
     dtypes: tuple[str, ...] = ("float32", "bfloat16")
+    only: tuple[str, ...] = ()
+
+    def wanted(self, name: str) -> bool:
+        """Whether the case of this name is run."""
+        return not self.only or name.startswith(self.only)
 
 
 class Suite(NamedTuple):

@@ -98,6 +98,8 @@ def case(forward: Forward, dtype: str) -> Case:
 def rows(options: Options) -> Iterator[Row]:
     """Each network in each compute type, then its peers."""
     for forward in forwards(options.width, options.height):
+        if not options.wanted(forward.name):
+            continue
         for dtype in options.dtypes:
             made = case(forward, dtype)
             parameters = count_parameters(made.arguments[0])

@@ -97,6 +97,8 @@ def rows(options: Options) -> Iterator[Row]:
     """A row per method, kind of frame and compute type: latencies of ``options.frames`` frames."""
     frames = inputs.frames(DISTINCT, options.width, options.height)
     for name, method in streamed_methods().items():
+        if not options.wanted(name):
+            continue
         variables = jax.jit(method.init)(jax.random.key(0), frames[0])
         for dtype in options.dtypes if count_parameters(variables) else ("float32",):
             yield from _method_rows(name, method, variables, frames, dtype, options)

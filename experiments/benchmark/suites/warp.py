@@ -66,6 +66,8 @@ def _resample(image, jitter):
 def rows(options: Options) -> Iterator[Row]:
     """Ours, then the peers of each case."""
     for case in cases(options.width, options.height):
+        if not options.wanted(case.name):
+            continue
         yield measure(case, options.repetitions)
         if options.peers:
             yield from peers.rows(case, options.repetitions)

@@ -11,9 +11,9 @@ from essjax import methods
 from essjax.rollout import SS, stream_step
 from experiments.benchmark import __main__ as command
 from experiments.benchmark import inputs, machine, schema, suites
-from experiments.benchmark.measure import Case, measure
+from experiments.benchmark.measure import Case, measure, time_calls
 from experiments.benchmark.section import section
-from experiments.benchmark.suites import networks, pipeline, train
+from experiments.benchmark.suites import networks, pipeline, train, warp
 
 
 def test_a_product_by_hand():
@@ -149,11 +149,50 @@ def test_the_command_writes_what_it_measured(tmp_path, monkeypatch, capsys):
     })  # fmt: skip
     arguments = ["--suite", "warp", "--size", "40x32", "--repetitions", "2", "--out", str(tmp_path)]
     assert command.main(arguments) == 0
-    (path,) = tmp_path.glob("benchmark-warp-cpu-jax-*.json")
+    (path,) = tmp_path.iterdir()
+    assert path.name == f"benchmark-warp-cpu-jax-{jax.__version__}-40x32.json"
     written = json.loads(path.read_text())
     assert written["rows"][0]["name"] == "double, 40x32" and written["facts"] == {"rows": 1.0}
     assert 0 < written["rows"][0]["roofline_fraction"] < 1 and written["settings"]["size"] == [40, 32]
     assert "double, 40x32 (essjax)" in capsys.readouterr().out
+
+
+def test_a_run_that_breaks_off_leaves_its_rows_and_the_older_result(tmp_path, monkeypatch):
+    def rows(options):
+        yield {
+            "name": "first",
+            "implementation": "essjax",
+            "median_ms": 1.0,
+            "iqr_ms": 0.0,
+            "repetitions": 2,
+            "work": {},
+        }
+        raise RuntimeError("second does not compile")
+
+    monkeypatch.setattr(suites, "load", lambda: {"warp": suites.Suite("", rows)})
+    monkeypatch.setattr(machine, "roofline", lambda n: {})
+    older = tmp_path / f"benchmark-warp-cpu-jax-{jax.__version__}.json"
+    older.write_text("older")
+    assert command.main(["--suite", "warp", "--out", str(tmp_path)]) == 2
+    assert older.read_text() == "older"
+    assert json.loads(older.with_suffix(".partial").read_text())["rows"][0]["name"] == "first"
+
+
+def test_only_the_cases_that_begin_so():
+    options = suites.Options(width=32, height=32, repetitions=1, peers=False, only=("bilinear", "fill"))
+    assert [row["name"] for row in warp.rows(options)] == ["bilinear, 32x32", "fill holes, 32x32"]
+
+
+def test_no_case_begins_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(machine, "roofline", lambda n: {})
+    assert command.main(["--suite", "warp", "--only", "trilinear", "--out", str(tmp_path)]) == 2
+    assert "--only trilinear: no case of the suite warp begins so." in capsys.readouterr().out
+
+
+def test_calls_are_queued_between_two_looks_at_the_clock():
+    calls, waits = [], []
+    seconds = time_calls(lambda: calls.append(0), 3, wait=waits.append, queued=4, warm_up=1)
+    assert seconds.shape == (3,) and len(calls) == 1 + 3 * 4 and len(waits) == 1 + 3
 
 
 @pytest.mark.parametrize(
