@@ -3,10 +3,11 @@
 import functools
 import importlib.util
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 
 from essjax.typing import Array
 
@@ -27,3 +28,27 @@ def call(kernel: Any, *arrays: Array, out_shape: Sequence[jax.ShapeDtypeStruct],
     else:
         os.environ["TRITON_CACHE_DIR"] = cache
     return list(jax_triton.triton_call(*cast(Any, arrays), kernel=kernel, out_shape=list(out_shape), **options))
+
+
+def over_batches(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
+    """Make a function that calls a kernel work under ``jax.vmap``: the new axis joins the batch.
+
+    Args:
+      function: its arrays have a leading axis of B, or of 1: one for all of the batch. Its results have one of B.
+    """
+    mapped = jax.custom_batching.custom_vmap(function)
+
+    @mapped.def_vmap
+    def rule(size: int, batched: list[bool], *arrays: Array):
+        batch = max(array.shape[int(has)] for array, has in zip(arrays, batched, strict=True))
+
+        def merge(array: Array, has: bool) -> Array:
+            if not has and array.shape[0] == 1:
+                return array
+            array = jnp.broadcast_to(array if has else array[None], (size, batch, *array.shape[1 + int(has) :]))
+            return array.reshape(size * batch, *array.shape[2:])
+
+        outputs = mapped(*(merge(array, has) for array, has in zip(arrays, batched, strict=True)))
+        return [output.reshape(size, batch, *output.shape[1:]) for output in outputs], [True] * len(outputs)
+
+    return mapped

@@ -222,7 +222,7 @@ def grid(height: int, width: int, batch: int) -> tuple[int, int, int]:
     return triton.cdiv(width, BLOCK[1]), triton.cdiv(height, BLOCK[0]), batch
 
 
-@jax.custom_batching.custom_vmap
+@kernels.over_batches
 def guided(radiance: Array, planes: Array, guide: Array, motion: Array, scale: Array) -> list[Array]:
     """The kernel: arguments and results of ``guided_kernel`` as arrays; leading axes are B, or 1 for all of a batch."""
     arrays = radiance, planes, guide, motion, scale
@@ -240,20 +240,3 @@ def guided(radiance: Array, planes: Array, guide: Array, motion: Array, scale: A
         num_warps=WARPS,
         **constants(radiance, guide, tuple(array.shape[0] == 1 for array in arrays)),
     )
-
-
-@guided.def_vmap
-def _guided_batch(size: int, batched: list[bool], *arrays: Array):
-    """A new axis in front joins the batch; what neither has stays one for all."""
-    batch = max(array.shape[int(has)] for array, has in zip(arrays, batched, strict=True))
-
-    def merge(array: Array, has: bool) -> Array:
-        inner = array.shape[int(has)]
-        if not has and inner == 1:
-            return array
-        array = array if has else array[None]
-        array = jnp.broadcast_to(array, (size, batch, *array.shape[2:]))
-        return array.reshape(size * batch, *array.shape[2:])
-
-    outputs = guided(*(merge(array, has) for array, has in zip(arrays, batched, strict=True)))
-    return [output.reshape(size, batch, *output.shape[1:]) for output in outputs], [True, True]

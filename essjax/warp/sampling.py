@@ -13,6 +13,7 @@ from typing import NamedTuple, cast
 import jax
 import jax.numpy as jnp
 
+from essjax import kernels
 from essjax.cameras import pixel_positions
 from essjax.typing import Array, Image, Mask, Motion, Positions
 from essjax.warp._batch import check_channels
@@ -144,11 +145,18 @@ def _sample_cubic(image: Array, positions: Array, mode: str, outside: str) -> Ar
 
     The image is ``[B, H, W, C]`` with positions ``[B, h, w, 2]``, or ``[H, W, C]`` with positions ``[..., h, w, 2]``.
     """
-    return _sample_taps(image, positions, mode, outside)
+    if not kernels.available():
+        return _sample_taps(image, positions, mode, outside)
+    from essjax.warp.sampling_triton import read_cubic  # an optional package
+
+    images = image.reshape(-1, *image.shape[-3:])
+    flat = positions.astype(jnp.float32).reshape(len(images), -1, 2)
+    values = read_cubic(images, flat, a=CUBIC_PARAMETER[mode], zeros=outside == "zeros")
+    return values.reshape(*positions.shape[:-1], image.shape[-1])
 
 
 def _cubic_forward(image, positions, mode, outside):
-    return _sample_taps(image, positions, mode, outside), (image, positions)
+    return _sample_cubic(image, positions, mode, outside), (image, positions)
 
 
 def _cubic_backward(mode, outside, residuals, gradient):
