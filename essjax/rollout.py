@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.frames import Frame, check_shapes, require, select_time, without_color
-from essjax.interfaces import Method
+from essjax.interfaces import Method, no_variables
 from essjax.networks import compute_dtype
 from essjax.typing import Array, Callable, PyTree, pytree
 
@@ -171,6 +171,23 @@ def _mean_state(states: list[dict[str, PyTree]]) -> dict[str, PyTree]:
 def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
     """Indices of the frames of one kind."""
     return [n for n, k in enumerate(kinds) if k == kind]
+
+
+def bake(method: Method, variables: PyTree) -> Method:
+    """``method`` with trained ``variables`` built in, for streaming and shipping; its own variables are ``{}``.
+
+    They become constants of the compiled step: what depends on them alone (rounding, layouts) is computed when it is
+    compiled, and a call passes fewer arguments. The steps cannot be trained any more.
+    """
+    constants = jax.device_get(variables)
+
+    def render_step(variables, history, frame, *, train=False):
+        return method.render_step(constants, history, frame, train=train)
+
+    def extrapolate_step(variables, history, frame, *, train=False):
+        return method.extrapolate_step(constants, history, frame, train=train)
+
+    return Method(no_variables, method.start, render_step, extrapolate_step, method.info)
 
 
 def stream_step(method: Method, kind: str, *, dtype: str = "float32", compiler_options: dict | None = None) -> Callable:

@@ -11,7 +11,7 @@ import pytest
 
 from essjax.frames import Prediction, select_time, without_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
-from essjax.rollout import ESS, SS, alternate, check_supported, every, frames_of, stream_step, unroll
+from essjax.rollout import ESS, SS, alternate, bake, check_supported, every, frames_of, stream_step, unroll
 from tests.helpers import make_frames
 
 
@@ -156,6 +156,13 @@ def test_unsupported_frames_and_schedules():
         check_supported(toy(requires=frozenset({"roughness"})), poor, EVERY)
     with pytest.raises(ValueError, match="toy needs the buffers color"):
         check_supported(toy(), without_color(frames), EVERY)
+
+
+def test_a_baked_method_needs_no_variables():
+    frames, baked = make_frames(6, T=5, H=4, W=5), bake(TOY, VARIABLES)
+    assert baked.init(jax.random.key(0), at(frames, 0)) == {} and baked.info == TOY.info
+    images = jax.jit(lambda frames: unroll(baked, {}, frames, EVEN).image)(frames)
+    np.testing.assert_allclose(images, compiled(EVEN)(frames).image, rtol=1e-6)
 
 
 def test_streaming_equals_the_rollout():

@@ -144,7 +144,8 @@ class FRNet(nn.Module):
                 flows = 2.0 * bilinear_upsample(flows)
                 coarser = [bilinear_upsample(features[-1])]
             total = flows + jnp.stack([matched[level], 3.0 * matched[level]])
-            newest, older = backward_warp(encoded[level], total)
+            # Warps of their own, else a GPU computes each read's place again for every channel.
+            newest, older = jax.lax.optimization_barrier(backward_warp(encoded[level], total))
             x = self.decoders[level](
                 jnp.concatenate([newest, older, *coarser, total[0], total[1], hints[level]], axis=-1)
             )

@@ -26,8 +26,8 @@ def _outer(d, a: tl.constexpr):
 
 
 @triton.jit
-def _taps(position, size: tl.constexpr, a: tl.constexpr, zeros: tl.constexpr):
-    """Indices and weights of the four pixels along one axis."""
+def _taps(position, size: tl.constexpr, step: tl.constexpr, a: tl.constexpr, zeros: tl.constexpr):
+    """Indices, times ``step``, and weights of the four pixels along one axis."""
     x = tl.minimum(tl.maximum(position, -3.0), size + 3.0) - 0.5
     first = tl.floor(x)
     t = x - first
@@ -40,7 +40,7 @@ def _taps(position, size: tl.constexpr, a: tl.constexpr, zeros: tl.constexpr):
         if zeros:
             weight = tl.where((index + k >= 0) & (index + k < size), weight, 0.0)
         kept = kept + (weight,)
-        indices = indices + (tl.minimum(tl.maximum(index + k, 0), size - 1),)
+        indices = indices + (tl.minimum(tl.maximum(index + k, 0), size - 1) * step,)
     return indices, kept
 
 
@@ -72,12 +72,13 @@ def cubic_kernel(
         image += item * (height * width * channels)
     if not shared[1]:
         positions += item * (2 * count)
-    columns, column_weights = _taps(tl.load(positions + 2 * place), width, a, zeros)
-    rows, row_weights = _taps(tl.load(positions + 2 * place + 1), height, a, zeros)
+    columns, column_weights = _taps(tl.load(positions + 2 * place), width, channels, a, zeros)
+    rows, row_weights = _taps(tl.load(positions + 2 * place + 1), height, 1, a, zeros)
     total = tl.zeros_like(row_weights[0])
     for row in tl.static_range(4):
+        first = rows[row] * (width * channels) + channel
         for column in tl.static_range(4):
-            value = tl.load(image + (rows[row] * width + columns[column]) * channels + channel).to(tl.float32)
+            value = tl.load(image + (first + columns[column])).to(tl.float32)
             total += value * (row_weights[row] * column_weights[column])
     tl.store(result + item * (count * channels) + number, total)
 

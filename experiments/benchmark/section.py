@@ -2,16 +2,23 @@
 
 from typing import Any
 
+from experiments.benchmark.measure import QUEUED
 from experiments.benchmark.schema import check
 
 NOTES = {
     "warp": "One image `[H, W, 3]`, float32. The guided warp reads 6 guide channels.",
     "networks": "One frame, weights as arguments. FLOP: two per multiply-add of convolutions and matrix products.",
-    "pipeline": "Whole methods, frame by frame: the frame to the device and the image back included, history donated, "
-    "any other transfer refused. Difference: largest between streamed and unrolled images, over their mean.",
+    "pipeline": "Whole methods, weights built in, frame by frame: the frame to the device and the image back included, "
+    "history donated, any other transfer refused. Difference: largest between streamed and unrolled images, over their "
+    "mean.",
     "train": "Both rollouts of ExtraSS, all losses, gradient and Adam; networks of 24 channels.",
     "scenes": "The built-in renderer, from outside: many jitted pieces.",
 }
+
+GPU_NOTE = (
+    f"{QUEUED['gpu']} calls one behind the other before each look at the clock (pipeline: one frame); device: for how "
+    "long a call keeps the GPU busy, by the profiler; float32 products are TF32."
+)
 
 
 def section(name: str, result: dict[str, Any]) -> str:
@@ -25,12 +32,13 @@ def section(name: str, result: dict[str, Any]) -> str:
         f"{machine['float32_flops_per_second'] / 1e9:.0f} GFLOP/s float32, "
         f"{machine['bfloat16_flops_per_second'] / 1e9:.0f} bfloat16"
     )
+    notes = [NOTES[result["suite"]]] + [GPU_NOTE] * any("device_ms" in row for row in result["rows"])
     lines = [
         f"## {name}",
         "",
         f"`python -m experiments.benchmark --suite {result['suite']}`; commit {environment['commit']}, "
         f"{environment['date']}; {environment['device']}; {packages}; {settings['repetitions']} repetitions, load "
-        f"{machine['load_at_start']:.1f} at the start. The machine in the same run: {limits}. {NOTES[result['suite']]}",
+        f"{machine['load_at_start']:.1f} at the start. The machine in the same run: {limits}. {' '.join(notes)}",
         "",
     ]
     return "\n".join([*lines, *_table(result["rows"]), "", *_facts(result["facts"])])

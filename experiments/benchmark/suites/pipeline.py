@@ -11,7 +11,7 @@ from essjax import methods
 from essjax.deploy import count_parameters
 from essjax.frames import Frame, without_color
 from essjax.interfaces import Method
-from essjax.rollout import ESS, SS, alternate, every, stream_step, unroll
+from essjax.rollout import ESS, SS, alternate, bake, every, stream_step, unroll
 from essjax.typing import PyTree
 from experiments.benchmark import inputs
 from experiments.benchmark.measure import Compilations, device_time, summary
@@ -101,12 +101,10 @@ def rows(options: Options) -> Iterator[Row]:
             continue
         variables = jax.jit(method.init)(jax.random.key(0), frames[0])
         for dtype in options.dtypes if count_parameters(variables) else ("float32",):
-            yield from _method_rows(name, method, variables, frames, dtype, options)
+            yield from _method_rows(name, bake(method, variables), frames, dtype, options)
 
 
-def _method_rows(
-    name: str, method: Method, variables: PyTree, frames: list, dtype: str, options: Options
-) -> Iterator[Row]:
+def _method_rows(name: str, method: Method, frames: list, dtype: str, options: Options) -> Iterator[Row]:
     kinds = (SS,) if method.info.renders_all else (SS, ESS)
     steps = {kind: stream_step(method, kind, dtype=dtype) for kind in kinds}
     building = {}
@@ -114,11 +112,11 @@ def _method_rows(
     for kind in kinds:
         given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
         with Compilations() as building[kind]:
-            history, _ = jax.block_until_ready(steps[kind](variables, history, given))
-    difference = largest_difference(method, steps, variables, frames) if dtype == "float32" else None
+            history, _ = jax.block_until_ready(steps[kind]({}, history, given))
+    difference = largest_difference(method, steps, {}, frames) if dtype == "float32" else None
     for resident in (True, False) if jax.default_backend() == "gpu" else (False,):
         with Compilations() as streaming:
-            seconds = stream(method, steps, variables, frames, options.frames, resident=resident)
+            seconds = stream(method, steps, {}, frames, options.frames, resident=resident)
         if streaming.count:
             raise RuntimeError(f"{name}: compiled {streaming.count} times while streaming.")
         for kind in kinds:
@@ -132,7 +130,7 @@ def _method_rows(
                 row["difference_from_unrolled"] = difference
             if resident:
                 given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
-                row |= busy(method, steps[kind], variables, given)
+                row |= busy(method, steps[kind], {}, given)
             yield row
 
 

@@ -112,6 +112,14 @@ def result():
     }  # fmt: skip
 
 
+def test_the_page_of_a_gpu_shows_its_own_time(result):
+    assert "profiler" not in section("benchmark-warp", result)
+    result["rows"][0]["device_ms"] = 1.5
+    page = section("benchmark-warp", result)
+    assert "| thing, 4x4 | essjax | 2 | 0.1 | 1.5 |  | 2000 Mpixels/s |" in page
+    assert "10 calls one behind the other" in page
+
+
 def test_the_page_shows_ratios_and_rates(result):
     page = section("benchmark-warp", result)
     assert "| thing, 4x4 | essjax | 2 | 0.1 |  | 2000 Mpixels/s | 2000 |" in page
