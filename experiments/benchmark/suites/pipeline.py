@@ -58,7 +58,8 @@ def stream(
     given = jax.block_until_ready(jax.device_put(given)) if resident else given
     for n, kind in enumerate(kinds):
         start = time.perf_counter()
-        frame = jax.device_put(given[kind][n % len(frames)])
+        frame = given[kind][n % len(frames)]
+        frame = frame if resident else jax.device_put(frame)
         with jax.transfer_guard("disallow"):
             history, image = steps[kind](variables, history, frame)
             image.block_until_ready()
