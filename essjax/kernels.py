@@ -1,9 +1,11 @@
 """Triton kernels in JAX programs: whether they can run here, and the call (optional: ``pip install 'essjax[gpu]'``)."""
 
+import contextlib
+import contextvars
 import functools
 import importlib.util
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
 import jax
@@ -11,11 +13,35 @@ import jax.numpy as jnp
 
 from essjax.typing import Array
 
+_plain: contextvars.ContextVar[bool] = contextvars.ContextVar("plain", default=False)
+
+
+@contextlib.contextmanager
+def plain() -> Iterator[None]:
+    """What is traced inside is what every backend runs: no kernels, nothing padded for a GPU.
+
+    To compare with, and to count work. Enter it inside the function that is jitted: jit's cache does not know of it.
+    """
+    token = _plain.set(True)
+    try:
+        yield
+    finally:
+        _plain.reset(token)
+
+
+def on_gpu() -> bool:
+    """Whether programs for a GPU are to be made."""
+    return jax.default_backend() == "gpu" and not _plain.get()
+
 
 @functools.cache
+def _installed() -> bool:
+    return importlib.util.find_spec("jax_triton") is not None
+
+
 def available() -> bool:
-    """Whether JAX runs on a GPU and ``jax-triton`` is installed."""
-    return jax.default_backend() == "gpu" and importlib.util.find_spec("jax_triton") is not None
+    """Whether kernels can run: JAX is on a GPU and ``jax-triton`` is installed."""
+    return on_gpu() and _installed()
 
 
 def call(kernel: Any, *arrays: Array, out_shape: Sequence[jax.ShapeDtypeStruct], **options: Any) -> list[Array]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from essjax.frames import Frame, GBuffers, without_color
 from essjax.interfaces import Method
+from essjax.kernels import plain
 from essjax.rollout import ESS, SS
 from essjax.typing import PyTree
 
@@ -59,13 +60,15 @@ def _count(jaxpr: Any) -> int:
 def multiply_adds(function, *arguments: PyTree) -> int:
     """Multiply-adds of the convolutions and matrix products in ``function(*arguments)``; it is traced, not run.
 
-    Element-wise work, gathers and warps are not counted, as in the papers. The body of a ``while`` loop counts once.
+    Element-wise work, gathers and warps are not counted, as in the papers, nor are channels that a GPU's program adds.
+    The body of a ``while`` loop counts once.
 
     Args:
       function: anything that ``jax.jit`` takes.
       arguments: arrays or ``jax.ShapeDtypeStruct``.
     """
-    return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
+    with plain():
+        return _count(jax.make_jaxpr(lambda *arguments: function(*arguments))(*arguments).jaxpr)
 
 
 def example_frame(width: int, height: int) -> Frame:

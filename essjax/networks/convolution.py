@@ -134,7 +134,7 @@ def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation
                 return _depthwise(lhs, rhs, pairs)
             return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _strided(lhs, rhs, strides[0], pairs)
     outputs = rhs.shape[3]
-    if groups == 1 and jax.default_backend() == "gpu":
+    if groups == 1 and kernels.on_gpu():
         lhs, rhs = pad_channels(lhs), _pad_kernel(rhs)
     result = lax.conv_general_dilated(
         lhs, rhs, window_strides, padding, lhs_dilation=lhs_dilation, rhs_dilation=rhs_dilation, **options

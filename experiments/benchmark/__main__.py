@@ -10,9 +10,9 @@ from typing import Any
 
 from rich.console import Console
 
+from experiments.benchmark.schema import SIZE
+
 SUITES = ("warp", "networks", "pipeline", "train", "scenes")
-SIZE = "960x540"
-"""Results of other sizes have theirs in the file's name."""
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:

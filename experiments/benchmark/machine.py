@@ -31,7 +31,10 @@ def roofline(repetitions: int, *, megabytes: int = 256, size: int | None = None)
 
 
 def roofline_fraction(row: dict[str, Any], machine: dict[str, float], dtype: str = "float32") -> float:
-    """Least time over measured time: the work at the machine's rate, or its arguments and results through memory."""
+    """Least time over measured time: the work at the machine's rate, or its arguments and results through memory.
+
+    On a GPU measured is the time for which it was busy: launches are the host's.
+    """
     rate = machine.get(f"{dtype}_flops_per_second", machine["float32_flops_per_second"])
     least = max(row["flops"] / rate, row["least_bytes"] / machine["copy_bytes_per_second"])
-    return least / (1e-3 * row["median_ms"])
+    return least / (1e-3 * row.get("device_ms", row["median_ms"]))

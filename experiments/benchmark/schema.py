@@ -2,6 +2,8 @@
 
 from typing import Any
 
+SIZE = "960x540"
+"""Of low-resolution frames; results of another have it in their file's name."""
 RESULT = {
     "schema": int, "kind": str, "suite": str, "environment": dict, "machine": dict, "settings": dict, "rows": list,
     "facts": dict,

@@ -3,7 +3,7 @@
 from typing import Any
 
 from experiments.benchmark.measure import QUEUED
-from experiments.benchmark.schema import check
+from experiments.benchmark.schema import SIZE, check
 
 NOTES = {
     "warp": "One image `[H, W, 3]`, float32. The guided warp reads 6 guide channels.",
@@ -32,11 +32,13 @@ def section(name: str, result: dict[str, Any]) -> str:
         f"{machine['float32_flops_per_second'] / 1e9:.0f} GFLOP/s float32, "
         f"{machine['bfloat16_flops_per_second'] / 1e9:.0f} bfloat16"
     )
+    size = "{}x{}".format(*settings["size"])
+    size = "" if size == SIZE else f" --size {size}"
     notes = [NOTES[result["suite"]]] + [GPU_NOTE] * any("device_ms" in row for row in result["rows"])
     lines = [
         f"## {name}",
         "",
-        f"`python -m experiments.benchmark --suite {result['suite']}`; commit {environment['commit']}, "
+        f"`python -m experiments.benchmark --suite {result['suite']}{size}`; commit {environment['commit']}, "
         f"{environment['date']}; {environment['device']}; {packages}; {settings['repetitions']} repetitions, load "
         f"{machine['load_at_start']:.1f} at the start. The machine in the same run: {limits}. {' '.join(notes)}",
         "",

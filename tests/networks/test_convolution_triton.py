@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax import kernels
+from essjax.deploy import multiply_adds
 from essjax.networks import compute_dtype, extrassnet
 from essjax.networks.convolution import LIKED, pad_channels
 from tests.triton_on_cpu import load
@@ -57,6 +59,21 @@ def test_a_network_is_the_same_by_it(monkeypatch):
     ours, calls = run("float16")
     assert calls > 0 and run("float32")[1] == 0
     np.testing.assert_allclose(ours, ordinary, atol=0.02 * np.abs(ordinary).max())
+
+
+def test_its_products_are_counted_as_ever(monkeypatch):
+    """On a GPU too: neither hidden in the kernel nor with the channels that are padded."""
+    network, x = extrassnet(16), jax.ShapeDtypeStruct((1, 16, 24, 31), jnp.float32)
+    variables = jax.eval_shape(lambda: network.init(jax.random.key(0), jnp.zeros(x.shape), jnp.zeros((1, 16, 24, 37))))
+
+    def apply(variables, x):
+        with compute_dtype("float16"):
+            return network.apply(variables, x, method="render")[0][0]
+
+    expected = multiply_adds(apply, variables, x)
+    monkeypatch.setattr(kernels, "_installed", lambda: True)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert kernels.available() and multiply_adds(apply, variables, x) == expected > 0
 
 
 def test_only_16_bit_channels_are_padded():

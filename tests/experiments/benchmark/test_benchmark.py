@@ -46,6 +46,7 @@ def test_roofline_fraction():
     limits = {"copy_bytes_per_second": 1e9, "float32_flops_per_second": 1e10, "bfloat16_flops_per_second": 1e11}
     by_memory = {"flops": 1e6, "least_bytes": 2e6, "median_ms": 4.0}
     assert machine.roofline_fraction(by_memory, limits) == pytest.approx(0.5)
+    assert machine.roofline_fraction({**by_memory, "device_ms": 2.5}, limits) == pytest.approx(0.8)
     by_products = {"flops": 1e8, "least_bytes": 2e6, "median_ms": 20.0}
     assert machine.roofline_fraction(by_products, limits) == pytest.approx(0.5)
     assert machine.roofline_fraction(by_products, limits, "bfloat16") == pytest.approx(0.1)
