@@ -10,6 +10,8 @@ import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
 from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
 
+RENDERER = "essjax.scenes"
+"""How datasets of the built-in renderer name it."""
 UNSAID = {"jitter": "halton", "ranges": False}
 """Settings that a dataset names only if they differ from these: it may be older than the choice."""
 Progress = Callable[[int, int], Any]
@@ -131,7 +133,7 @@ def generate(
       ValueError: the folder holds data made with other settings, or a setting is invalid.
     """
     out, clips = Path(out), list(clips)
-    shared = {"renderer": "essjax.scenes", "width": width, "height": height, "scale": scale, "native": native}
+    shared = {"renderer": RENDERER, "width": width, "height": height, "scale": scale, "native": native}
     shared["mip_bias"] = float(mip_bias)
     settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
     shared |= {key: settings[key] for key, usual in UNSAID.items() if settings[key] != usual}

@@ -16,7 +16,8 @@ class Config:
       002: 0 for its dataset 1, -1 for its dataset 2), jitter ("halton", or "dlctus" where every frame is rendered).
     Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
       learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (decay the
-      learning rate also where a paper keeps it), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
+      learning rate also where a paper keeps it), fresh (new train scenes after so many steps, rendered in the meantime;
+      None: always those on disk), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
       of VGG-16 weights).
     Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
       scored at the start and after a cut), pictures (chosen frames per sequence).
@@ -48,6 +49,7 @@ class Config:
     steps: int | None = None
     seconds: float | None = 245.0
     anneal: bool = True
+    fresh: int | None = None
     save_every: float = 30.0
     feature_weight: float = 0.001
     occlusion_weight: float = 0.3
@@ -141,6 +143,8 @@ def _check(config: Config) -> None:
         steps, seconds = f"{name}_steps".lstrip("_"), f"{name}_seconds".lstrip("_")
         if getattr(config, steps) is None and getattr(config, seconds) is None:
             raise ValueError(f"--set: {steps} and {seconds} are both null; give one of them.")
+    if config.fresh is not None and config.fresh < 1:
+        raise ValueError(f"--set fresh: expected at least 1 step on each round of scenes, got {config.fresh}.")
     for name in ("clip", "train_frames", "test_frames"):
         if getattr(config, name) < 2:
             raise ValueError(f"--set {name}: expected at least 2 frames, got {getattr(config, name)}.")

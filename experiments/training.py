@@ -9,9 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from essjax.data import clips, disk_source
+from essjax.data import CachedSource, Rounds, clips, disk_source
 from essjax.data.layout import Dataset
 from essjax.frames import select_time
+from essjax.generate import RENDERER, live_source, plan
 from essjax.train import Checkpoints, create_state, learning_rate, make_train_step, optimizer, train
 from essjax.typing import PyTree
 from experiments.config import Config
@@ -23,10 +24,13 @@ OnStep = Callable[[str, int, float, dict[str, float]], None]
 
 
 def make_batches(dataset: Dataset, config: Config, stage: Stage):
-    """A grain iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
+    """An iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
+
+    With ``config.fresh`` the scenes on disk are the first round, and each further one is rendered while the last is
+    trained on.
 
     Raises:
-      ValueError: no sequence is long enough for a clip, or the crop is too small.
+      ValueError: no sequence is long enough for a clip, the crop is too small, or ``fresh`` with imported data.
     """
     info = dataset.info
     width, height = (min(a, b) for a, b in zip(config.crop, (info.width, info.height), strict=True))
@@ -37,8 +41,26 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
         )
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
     length = min(config.clip, longest)
-    source = disk_source(dataset, "train", ranges=stage.ranges)
-    return iter(clips(source, length=length, batch=stage.batch, crop=(height, width), seed=config.seed))
+    cut = {"length": length, "batch": stage.batch, "crop": (height, width)}
+
+    def make(number: int):
+        source = disk_source(dataset, "train", ranges=stage.ranges) if number == 0 else fresh(number)
+        return iter(clips(source, **cut, seed=config.seed + number))
+
+    def fresh(number: int) -> CachedSource:
+        start = config.seed + number * config.train_sequences
+        scenes = plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=start)
+        settings = {"scale": config.scale, "mip_bias": config.mip_bias, "jitter": config.jitter}
+        return live_source(scenes, info.width, info.height, ranges=stage.ranges, **settings)
+
+    if config.fresh is None:
+        return make(0)
+    if dataset.source.get("renderer") != RENDERER:
+        raise ValueError(
+            f"--set fresh={config.fresh}: {dataset.path} was not made by the built-in renderer, so there are no new "
+            "scenes of it. Leave fresh away, or train on the built-in scenes (no --data)."
+        )
+    return Rounds(make, config.fresh)
 
 
 def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> PyTree:

@@ -5,10 +5,11 @@ from essjax.data.importing import PRESETS, ImportReport, import_dataset
 from essjax.data.layout import Dataset, Segment, SequenceInfo, read_dataset, write_dataset
 from essjax.data.loader import CachedSource, Source, clips, disk_source
 from essjax.data.read import read_segment, read_sequence
+from essjax.data.rounds import Rounds
 from essjax.data.store import SequenceWriter, write_sequence
 
 __all__ = [
-    "PRESETS", "CachedSource", "Dataset", "ImportReport", "Segment", "SequenceInfo", "SequenceWriter", "Source",
-    "clips", "crop", "disk_source", "flip", "import_dataset", "read_dataset", "read_segment", "read_sequence",
+    "PRESETS", "CachedSource", "Dataset", "ImportReport", "Rounds", "Segment", "SequenceInfo", "SequenceWriter",
+    "Source", "clips", "crop", "disk_source", "flip", "import_dataset", "read_dataset", "read_segment", "read_sequence",
     "start_with_cut", "write_dataset", "write_sequence",
 ]  # fmt: skip
