@@ -1,13 +1,15 @@
 """Settings of the whole suite, and the fixtures that every test may use."""
 
 import os
+import shutil
 import tempfile
 
 # Before JAX starts: the suite spends its time on compiling, and LLVM without optimisation compiles in two thirds of it.
 # XLA's own passes stay on. Set XLA_FLAGS (also to nothing) to test what users run; a test of speed must not rely on it.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
-# Triton kernels are tested in its interpreter; Triton reads this when it is imported.
-os.environ.setdefault("TRITON_INTERPRET", "1")
+# Without a GPU Triton kernels are tested in its interpreter; Triton reads this when it is imported.
+if shutil.which("nvidia-smi") is None:
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402

@@ -1,4 +1,4 @@
-"""Triton kernels without a GPU: in Triton's interpreter, called back from JAX programs."""
+"""Triton kernels without a GPU: in Triton's interpreter, called back from JAX programs. With one: as they are."""
 
 import importlib
 import sys
@@ -10,11 +10,19 @@ import pytest
 from essjax import kernels
 
 
+def is_called(function, *arguments) -> bool:
+    """Whether a function's program calls a kernel."""
+    program = str(jax.make_jaxpr(function)(*arguments))
+    return "pure_callback" in program or "triton_kernel_call" in program
+
+
 def load(name: str, monkeypatch) -> object:
-    """Import the module of a kernel; until the test ends, ``kernels.call`` runs it in the interpreter (see conftest).
+    """Import the module of a kernel; without a GPU ``kernels.call`` runs it in the interpreter until the test ends.
 
     Skips where Triton or PyTorch, which its interpreter needs, is missing.
     """
+    if kernels.available():
+        return importlib.import_module(name)
     pytest.importorskip("triton")
     torch = pytest.importorskip("torch")
     monkeypatch.delitem(sys.modules, name, raising=False)
@@ -31,7 +39,7 @@ def load(name: str, monkeypatch) -> object:
         return jax.pure_callback(run, shapes, *arrays)
 
     monkeypatch.setattr(kernels, "call", call)
-    monkeypatch.setattr(kernels, "available", lambda: True)
+    monkeypatch.setattr(kernels, "available", lambda: not kernels._plain.get())
     module = importlib.import_module(name)
     monkeypatch.setitem(sys.modules, name, module)  # and forget it with the test
     return module
