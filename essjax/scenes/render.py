@@ -191,10 +191,12 @@ def in_tiles(
       y: flat screen positions, down.
       width: of the image, pixels.
       height: of the image, pixels.
-      rays: per call; always the same, so that there is one compilation.
+      rays: per call at most; the same in all calls for one image, so that there is one compilation.
       samples: per pixel.
     """
     size = max(1, rays // samples)
+    if jax.default_backend() != "cpu":  # calls alike, but no small image padded to a chunk that is made for large ones
+        size = -(-width * height // -(-width * height // size))
     order = tile_order(width, height, max(1, int(size**0.5)))
     pieces = -(-order.size // size)
     padded = np.pad(order, (0, pieces * size - order.size), mode="edge").reshape(pieces, size)

@@ -70,7 +70,9 @@ def test_the_import_benchmark_measures_what_it_says(tmp_path, monkeypatch):
     import_benchmark.make_dump(tmp_path, 52)
     measured = import_benchmark.measure(tmp_path, 52, with_reference=True, workers=2)
     assert measured["frames"] == 52 and len(measured["resident_megabytes"]) == 2
-    assert measured["cpu_seconds_per_frame"] > 0 and 50 < measured["resident_megabytes"][0] < 5000
+    assert (
+        measured["cpu_seconds_per_frame"] > 0 and 50 < measured["resident_megabytes"][0] < 50_000
+    )  # MB, of a worker with whatever it ran before
     text = benchmarks_page.page([("import", {"kind": "import", "machine": "2 cores", "cases": {"small": measured}})])
     assert f"| small | 52 | {measured['frames_per_second']:.1f} |" in text
     assert not (tmp_path / "out").exists()
