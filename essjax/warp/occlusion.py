@@ -9,7 +9,7 @@ from essjax.frames import GBuffers
 from essjax.typing import Array, Jitter, Mask, Motion, Plane
 from essjax.warp._batch import check_channels
 from essjax.warp.motion import jittered_motion, splat_motion
-from essjax.warp.sampling import axis_taps, inside_mask, sample
+from essjax.warp.sampling import axis_taps, fetch, inside_mask, sample
 
 _MIN_N_DOT_V = 0.1
 _TYPICAL_N_DOT_V = 0.25  # where the channel is absent: towards grazing, so that floors are not holes
@@ -127,8 +127,7 @@ def hole_mask(
     valid = jnp.zeros((*positions.shape[:-1], 1), bool)
     for row in rows:
         for column in columns:
-            tap = jnp.stack([column.index, row.index], axis=-1) + 0.5
-            there = jax.tree.map(lambda image, at=tap: sample(image, at, mode="nearest"), previous)
+            there = jax.tree.map(lambda image, x=column.index, y=row.index: fetch(image, x, y), previous)
             same = _same_surface(
                 current, there, normal_threshold, position_threshold, depth_threshold, stencil_threshold
             )

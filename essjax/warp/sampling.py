@@ -91,6 +91,18 @@ def stack_images(image: Array) -> tuple[Array, Array | int]:
     return image.reshape(batch * height, *rest), (jnp.arange(batch, dtype=jnp.int32) * height)[:, None, None]
 
 
+def fetch(image: Array, column: Array, row: Array) -> Array:
+    """Pixels ``[..., h, w, C]`` of ``[..., H, W, C]`` at integer places ``[..., h, w]``, known to be inside."""
+    width, channels = image.shape[-2:]
+    leading = jnp.broadcast_shapes(image.shape[:-3], column.shape[:-2])
+    image = image if math.prod(image.shape[:-3]) == 1 else jnp.broadcast_to(image, (*leading, *image.shape[-3:]))
+    place = jnp.broadcast_to(row * width + column, (*leading, *column.shape[-2:]))
+    stacked, first = stack_images(merge_leading_axes(image))
+    images = 1 if isinstance(first, int) else first.shape[0]
+    index = first * width + place.reshape(images, -1, *place.shape[-1:])
+    return gather_pixels(stacked.reshape(-1, channels), index).reshape(*place.shape, channels)
+
+
 def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Array:
     """One gather per tap: they fuse with the arithmetic. Arguments as ``_sample_cubic``."""
     height, width, channels = image.shape[-3:]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from essjax.cameras import pixel_positions
 from essjax.warp import backward_warp, inside_mask, sample
-from essjax.warp.sampling import MODES, OUTSIDE
+from essjax.warp.sampling import MODES, OUTSIDE, fetch
 
 H, W = 7, 10
 FEW = settings(max_examples=12, deadline=None)
@@ -261,3 +261,15 @@ def test_errors_name_the_argument():
         backward_warp(image, motion[:5])
     with pytest.raises(ValueError, match=r"positions: expected \[..., H, W, 2\], got \(7, 10, 3\)"):
         sample(image, image)
+
+
+def test_fetch_reads_pixels_of_each_image_and_of_one_for_all():
+    rng = np.random.default_rng(0)
+    images, one = rng.normal(size=(2, 3, 5, 7, 2)).astype(np.float32), rng.normal(size=(5, 7, 2)).astype(np.float32)
+    column, row = rng.integers(0, 7, (2, 3, 4, 6)), rng.integers(0, 5, (2, 3, 4, 6))
+    a, b = np.ogrid[:2, :3]
+    expected = images[a[..., None, None], b[..., None, None], row, column]
+    np.testing.assert_array_equal(jax.jit(fetch)(images, column, row), expected)
+    np.testing.assert_array_equal(fetch(one, column, row), one[row, column])
+    np.testing.assert_array_equal(fetch(one, column[0, 0], row[0, 0]), one[row[0, 0], column[0, 0]])
+    np.testing.assert_array_equal(fetch(images[0], column[0, 0], row[0, 0]), images[0][:, row[0, 0], column[0, 0]])
