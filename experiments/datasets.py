@@ -2,10 +2,22 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from essjax.data import Dataset, read_dataset
-from essjax.generate import generate, plan
+from essjax.generate import Clip, generate, plan
 from experiments.config import Config
+
+
+def train_clips(config: Config, number: int = 0) -> list[Clip]:
+    """Round ``number`` of scenes to train on: 0 are those on disk, each further one (``fresh``) has new seeds."""
+    start = config.seed + number * config.train_sequences
+    return plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=start)
+
+
+def render_settings(config: Config) -> dict[str, Any]:
+    """Of the built-in renderer, for all splits."""
+    return {"scale": config.scale, "mip_bias": config.mip_bias, "jitter": config.jitter}
 
 
 def prepare(
@@ -35,12 +47,11 @@ def prepare(
     else:
         width, height = config.size
         clips = [
-            *plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=config.seed),
+            *train_clips(config),
             *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp),
             *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
         ]
-        settings = {"scale": config.scale, "native": True, "mip_bias": config.mip_bias, "jitter": config.jitter}
-        settings["ranges"] = ranges
+        settings = {**render_settings(config), "native": True, "ranges": ranges}
         dataset = generate(out / "scenes", clips, width, height, progress=progress, **settings)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):

@@ -1,5 +1,6 @@
 """``--profile``: a JAX profiler trace of the train step and of the streaming steps."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -27,7 +28,10 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
         variables = initial_variables(stages, dataset, config)
         transform = optimizer()
         step = make_train_step(stage.objective, transform, stage.name)
-        state, batch = create_state(variables, stage.name, transform), next(make_batches(dataset, config, stage))
+        state, batch = (
+            create_state(variables, stage.name, transform),
+            next(make_batches(dataset, dataclasses.replace(config, fresh=None), stage)),
+        )
         state, _ = step(state, batch, stage.learning_rate)
         method, frames = stage.method, jax.tree.map(lambda leaf: leaf[:, :1], batch.frames)
         variables = state.variables

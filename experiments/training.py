@@ -1,5 +1,6 @@
 """Train a variant: its stages in order, each resumable from its newest checkpoint."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -12,10 +13,11 @@ import numpy as np
 from essjax.data import CachedSource, Rounds, clips, disk_source
 from essjax.data.layout import Dataset
 from essjax.frames import select_time
-from essjax.generate import RENDERER, live_source, plan
+from essjax.generate import RENDERER, live_source
 from essjax.train import Checkpoints, create_state, learning_rate, make_train_step, optimizer, train
 from essjax.typing import PyTree
 from experiments.config import Config
+from experiments.datasets import render_settings, train_clips
 from experiments.variants.base import Stage
 
 MIN_CROP = 24
@@ -48,10 +50,8 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
         return iter(clips(source, **cut, seed=config.seed + number))
 
     def fresh(number: int) -> CachedSource:
-        start = config.seed + number * config.train_sequences
-        scenes = plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=start)
-        settings = {"scale": config.scale, "mip_bias": config.mip_bias, "jitter": config.jitter}
-        return live_source(scenes, info.width, info.height, ranges=stage.ranges, **settings)
+        settings = {**render_settings(config), "ranges": stage.ranges}
+        return live_source(train_clips(config, number), info.width, info.height, **settings)
 
     if config.fresh is None:
         return make(0)
@@ -65,7 +65,8 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
 
 def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> PyTree:
     """Fresh variables of the last stage's method, which holds those of the stages before it."""
-    batch = next(make_batches(dataset, config, stages[-1]))
+    # Without fresh scenes: the next round would be rendered for nothing.
+    batch = next(make_batches(dataset, dataclasses.replace(config, fresh=None), stages[-1]))
     example = jax.tree.map(np.asarray, select_time(batch.frames, 0))
     return stages[-1].method.init(jax.random.key(config.seed), example)
 

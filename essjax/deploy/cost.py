@@ -67,7 +67,7 @@ def multiply_adds(function, *arguments: PyTree) -> int:
       function: anything that ``jax.jit`` takes.
       arguments: arrays or ``jax.ShapeDtypeStruct``.
     """
-    with plain():
+    with plain():  # in a new function: JAX may remember how it traced the old one
         return _count(jax.make_jaxpr(lambda *arguments: function(*arguments))(*arguments).jaxpr)
 
 

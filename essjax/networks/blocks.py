@@ -89,7 +89,10 @@ class Conv(nn.Conv):
     @nn.compact
     def __call__(self, x: Image) -> Image:
         """Return ``[..., H / stride, W / stride, features]``."""
-        channels, plain = x.shape[-1], self.strides == (1, 1) and self.padding == "SAME"
+        channels, plain = x.shape[-1], self.strides == (1, 1) and self.padding == "SAME" and self.use_bias
+        plain &= (
+            self.feature_group_count == 1 and self.kernel_dilation in (1, None) and self.input_dilation in (1, None)
+        )
         if plain and self.kernel_size == (3, 3) and fits_kernel(channels, self.features):
             kernel = self.param("kernel", self.kernel_init, (3, 3, channels, self.features), self.param_dtype)
             bias = self.param("bias", self.bias_init, (self.features,), self.param_dtype)

@@ -183,7 +183,5 @@ def convolve_leaky(x: jax.Array, kernel: jax.Array, bias: jax.Array, slope: floa
     """
     from essjax.networks.convolution_triton import convolve  # an optional package
 
-    images = pad_channels(x).reshape(-1, *x.shape[-3:-1], x.shape[-1] + -x.shape[-1] % LIKED)
-    kernel = jnp.pad(kernel, [(0, 0), (0, 0), (0, images.shape[-1] - kernel.shape[2]), (0, 0)])
-    result = convolve(images, kernel, bias.astype(jnp.float32), slope)
+    result = convolve(x.reshape(-1, *x.shape[-3:]), kernel, bias.astype(jnp.float32), slope)
     return result.reshape(*x.shape[:-1], kernel.shape[3])

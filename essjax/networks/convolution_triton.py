@@ -13,6 +13,7 @@ import triton.language as tl
 from jax import lax
 
 from essjax import kernels
+from essjax.networks.convolution import pad_channels
 from essjax.typing import Array
 
 
@@ -21,14 +22,14 @@ def conv3x3_kernel(
     x, kernel, bias, y,
     height: tl.constexpr, width: tl.constexpr, channels: tl.constexpr, outputs: tl.constexpr,
     padded_channels: tl.constexpr, padded_outputs: tl.constexpr, chunk: tl.constexpr, slope: tl.constexpr,
-    block_rows: tl.constexpr, block_columns: tl.constexpr, stages: tl.constexpr,
+    shared: tl.constexpr, block_rows: tl.constexpr, block_columns: tl.constexpr, stages: tl.constexpr,
 ):  # fmt: skip
     """One tile of pixels of one image, all output channels.
 
     Args:
       x: ``[B, height, width, channels]``.
-      kernel: ``[3, 3, padded_channels, padded_outputs]``, zeros in the padding.
-      bias: float32 ``[padded_outputs]``.
+      kernel: ``[B, 3, 3, padded_channels, padded_outputs]``, zeros in the padding.
+      bias: float32 ``[B, padded_outputs]``.
       y: result, ``[B, height, width, outputs]``.
       height: of the images.
       width: of the images.
@@ -38,6 +39,7 @@ def conv3x3_kernel(
       padded_outputs: a power of 2.
       chunk: channels multiplied at once.
       slope: of the leaky ReLU; 1 for none.
+      shared: of the three arrays, whether there is one for the whole batch.
       block_rows: of a tile.
       block_columns: of a tile.
       stages: of the pipeline of loads.
@@ -48,7 +50,12 @@ def conv3x3_kernel(
     column = tl.program_id(0) * block_columns + pixel % block_columns
     channel = tl.arange(0, chunk)
     output = tl.arange(0, padded_outputs)
-    x += item * (height * width * channels)
+    if not shared[0]:
+        x += item * (height * width * channels)
+    if not shared[1]:
+        kernel += item * (9 * padded_channels * padded_outputs)
+    if not shared[2]:
+        bias += item * padded_outputs
     total = tl.zeros((block_rows * block_columns, padded_outputs), tl.float32)
     chunks: tl.constexpr = padded_channels // chunk
     for step in tl.range(0, 9 * chunks, num_stages=stages):
@@ -94,24 +101,31 @@ def convolve(x: Array, kernel: Array, bias: Array, slope: float) -> Array:
     """Leaky ReLU of a 3x3 convolution with zero padding: ``[B, H, W, I]`` to ``[B, H, W, O]``.
 
     Args:
-      x: bfloat16 or float16, ``[B, H, W, I]``; I is a multiple of 8.
+      x: bfloat16 or float16, ``[B, H, W, I]``.
       kernel: of the same type, ``[3, 3, I, O]``.
       bias: float32 ``[O]``.
       slope: of the leaky ReLU; 1 for none.
     """
-    batch, height, width, channels = x.shape
-    chosen = settings(channels, kernel.shape[3])
-    grid = triton.cdiv(width, chosen["block_columns"]), triton.cdiv(height, chosen["block_rows"]), batch
-    return kernels.call(
-        conv3x3_kernel,
-        x,
-        pack(kernel, chosen["padded_channels"], chosen["padded_outputs"]),
-        jnp.pad(bias, (0, chosen["padded_outputs"] - bias.size)),
-        out_shape=[jax.ShapeDtypeStruct((batch, height, width, bias.size), x.dtype)],
-        grid=grid,
-        height=height, width=width, channels=channels, outputs=bias.size, slope=slope,
-        **chosen,
-    )[0]  # fmt: skip
+    images, outputs = pad_channels(x), bias.size
+    height, width, channels = images.shape[1:]
+    chosen = settings(channels, outputs)
+    tiles = triton.cdiv(width, chosen["block_columns"]), triton.cdiv(height, chosen["block_rows"])
+
+    @kernels.over_batches
+    def run(*arrays: Array) -> list[Array]:
+        batch = max(array.shape[0] for array in arrays)
+        return kernels.call(
+            conv3x3_kernel,
+            *arrays,
+            out_shape=[jax.ShapeDtypeStruct((batch, height, width, outputs), x.dtype)],
+            grid=(*tiles, batch),
+            height=height, width=width, channels=channels, outputs=outputs, slope=slope,
+            shared=tuple(array.shape[0] == 1 for array in arrays),
+            **chosen,
+        )  # fmt: skip
+
+    packed = pack(kernel, chosen["padded_channels"], chosen["padded_outputs"])
+    return run(images, packed[None], jnp.pad(bias, (0, chosen["padded_outputs"] - outputs))[None])[0]
 
 
 def reference(x: Array, kernel: Array, bias: Array, slope: float) -> Array:

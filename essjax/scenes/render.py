@@ -56,11 +56,15 @@ def color_along(world: World, x: Array, y: Array, angle: Array) -> Float[Array, 
     return stack(radiance(world, origin, direction, angle))
 
 
+def _spread(x: Array, y: Array, offsets: Array) -> list[Array]:
+    """All samples of all pixels, samples first: ``[S * N]``, right and down."""
+    return [(v[None] + offsets[:, k, None]).ravel() for k, v in enumerate((x, y))]
+
+
 @jax.jit
 def average_color(world: World, x: Array, y: Array, offsets: Array, angle: Array) -> Float[Array, "N 3"]:
     """Mean of ``color_along`` over ``offsets`` ``[S, 2]`` around each screen position."""
-    places = [(v[None] + offsets[:, k, None]).ravel() for k, v in enumerate((x, y))]
-    return color_along(world, *places, angle).reshape(len(offsets), x.size, 3).mean(axis=0)
+    return color_along(world, *_spread(x, y, offsets), angle).reshape(len(offsets), x.size, 3).mean(axis=0)
 
 
 def _follow(previous: World, s: Surface, direction: Vec) -> tuple[Vec, Vec, Array]:
@@ -220,12 +224,6 @@ def pixel_angle(world: World, width: int, mip_bias: float = 0.0) -> np.float32:
     return np.float32(2.0**mip_bias / (float(world.focal) * width))
 
 
-def _spread(x: np.ndarray, y: np.ndarray, offsets: np.ndarray, rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """All samples of all pixels, samples first, padded to ``rays``."""
-    pad = (0, rays - x.size * len(offsets))
-    return tuple(np.pad((v[None] + offsets[:, k, None]).ravel(), pad, mode="edge") for k, v in enumerate((x, y)))  # type: ignore[return-value]
-
-
 def render_reference(world: World, width: int, height: int, *, spp: int = 64) -> np.ndarray:
     """Anti-aliased image ``[H, W, 3]``: ``spp`` samples per pixel, box filter."""
     world = jax.device_put(world)
@@ -269,13 +267,13 @@ def render_statistics(
 ) -> dict[str, np.ndarray]:
     """Images ``[H, W, C]`` of what ``sequence.subsample_statistics`` returns, and the same samples' ``reference``."""
     world, previous = jax.device_put((world, previous))
-    offsets = (reference_samples(spp) - 0.5) / width
+    offsets = ((reference_samples(spp) - 0.5) / width).astype(np.float32)
     angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
 
     def ranges(x, y):
-        places = _spread(x, y, offsets, rays)
+        places = _spread(x, y, offsets)
         samples = {"color": color_along(world, *places, angle), **surfaces(world, previous, *places, angle)}
-        samples = {name: s[: x.size * spp].reshape(spp, x.size, -1) for name, s in samples.items()}
+        samples = {name: s.reshape(spp, x.size, -1) for name, s in samples.items()}
         reference = samples["color"].mean(axis=0)
         samples = jax.device_get(samples)
         color, depth = samples["color"], samples["depth"]

@@ -10,7 +10,7 @@ import pytest
 
 from essjax.data import Rounds
 from essjax.generate import generate, plan
-from experiments import training
+from experiments import datasets
 from experiments.config import make_config
 from experiments.training import make_batches
 from experiments.variants import config_of, stages_of
@@ -25,7 +25,7 @@ def dataset(tmp_path_factory):
 
 
 def batches(dataset, monkeypatch, *settings):
-    monkeypatch.setattr(training, "plan", functools.partial(plan, families=["carousel"]))
+    monkeypatch.setattr(datasets, "plan", functools.partial(plan, families=["carousel"]))
     config = config_of("extrass", "smoke", [*SETTINGS, *settings])
     return make_batches(dataset, config, stages_of("extrass", config)[-1])
 

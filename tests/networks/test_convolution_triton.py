@@ -8,6 +8,7 @@ import pytest
 from essjax import kernels
 from essjax.deploy import multiply_adds
 from essjax.networks import compute_dtype, extrassnet
+from essjax.networks.blocks import conv
 from essjax.networks.convolution import LIKED, pad_channels
 from tests.triton_on_cpu import is_called, load
 
@@ -26,6 +27,37 @@ def test_equals_the_ordinary_convolution(monkeypatch, channels, outputs, slope):
     arguments = inputs(channels, outputs)
     ours, xla = (f(*(jnp.asarray(a) for a in arguments), slope) for f in (module.convolve, module.reference))
     np.testing.assert_allclose(ours.astype(np.float32), xla.astype(np.float32), rtol=2e-3, atol=5e-3)  # one half ulp
+
+
+def test_under_vmap(monkeypatch):
+    """Over images with one kernel for all, and over kernels and biases."""
+    module = load(NAME, monkeypatch)
+    x, kernel, bias = inputs(8, 5, (3, 2, 7, 9))
+    kernels_, biases = np.stack([kernel, -kernel, 2 * kernel]), np.stack([bias, bias + 1, bias - 1])
+    for axes, arguments in (((0, None, None), (x, kernel, bias)), ((None, 0, 0), (x[0], kernels_, biases))):
+        ours, xla = (
+            jax.vmap(lambda *a, f=f: f(*a, 0.1), axes)(*(jnp.asarray(a) for a in arguments))
+            for f in (module.convolve, module.reference)
+        )
+        assert ours.shape == (3, 2, 7, 9, 5)
+        np.testing.assert_allclose(ours.astype(np.float32), xla.astype(np.float32), rtol=2e-3, atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "options", [{"feature_group_count": 8}, {"use_bias": False}, {"kernel_dilation": 2}, {"padding": "VALID"}]
+)
+def test_other_convolutions_are_left_to_xla(monkeypatch, options):
+    load(NAME, monkeypatch)
+    x = jnp.ones((1, 9, 10, 8))
+
+    def uses_it(module):
+        def apply(variables, x):
+            with compute_dtype("float16"):
+                return module.apply(variables, x)
+
+        return is_called(apply, module.init(jax.random.key(0), x), x)
+
+    assert uses_it(conv(8)) and not uses_it(conv(8, **options))
 
 
 def test_its_derivative_is_the_ordinary_ones(monkeypatch):
