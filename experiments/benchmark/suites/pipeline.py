@@ -12,7 +12,6 @@ from essjax.deploy import count_parameters
 from essjax.frames import Frame, without_color
 from essjax.interfaces import Method
 from essjax.rollout import ESS, SS, alternate, bake, every, stream_step, unroll
-from essjax.typing import PyTree
 from experiments.benchmark import inputs
 from experiments.benchmark.measure import Compilations, device_time, summary
 from experiments.benchmark.suites import Options, Row
@@ -39,14 +38,13 @@ def streamed_methods() -> dict[str, Method]:
 
 
 def stream(
-    method: Method, steps: dict[str, Callable], variables: PyTree, frames: list, count: int, *, resident: bool = False
+    method: Method, steps: dict[str, Callable], frames: list, count: int, *, resident: bool = False
 ) -> dict[str, np.ndarray]:
     """Seconds of each frame by kind, frame into the device and image out of it included; everything else is refused.
 
     Args:
-      method: says what the history is and whether every frame is rendered.
+      method: weights built in (``bake``); says what the history is and whether every frame is rendered.
       steps: kind -> from ``stream_step``, compiled.
-      variables: on the device.
       frames: on the host, rendered in turn.
       count: frames to stream.
       resident: frames are on the device already, and images stay there, as in a renderer on the same GPU.
@@ -61,7 +59,7 @@ def stream(
         frame = given[kind][n % len(frames)]
         frame = frame if resident else jax.device_put(frame)
         with jax.transfer_guard("disallow"):
-            history, image = steps[kind](variables, history, frame)
+            history, image = steps[kind]({}, history, frame)
             image.block_until_ready()
         if not resident:
             jax.device_get(image)
@@ -69,27 +67,27 @@ def stream(
     return {kind: np.array(values) for kind, values in seconds.items()}
 
 
-def busy(method: Method, step: Callable, variables: PyTree, frame: Frame) -> dict[str, float]:
+def busy(method: Method, step: Callable, frame: Frame) -> dict[str, float]:
     """``device_ms`` of one kind of frame, see ``measure.device_time``."""
     state = [method.start(frame)]
 
     def call():
-        state[0], image = step(variables, state[0], frame)
+        state[0], image = step({}, state[0], frame)
         return image
 
     call()
     return device_time(call)
 
 
-def largest_difference(method: Method, steps: dict[str, Callable], variables: PyTree, frames: list) -> float:
+def largest_difference(method: Method, steps: dict[str, Callable], frames: list) -> float:
     """Between streamed and unrolled images of the first frames, relative to the images' mean."""
     schedule = every() if method.info.renders_all else alternate()
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames[:COMPARED])
-    unrolled = jax.jit(lambda variables, frames: unroll(method, variables, frames, schedule).image)(variables, stacked)
+    unrolled = jax.jit(lambda frames: unroll(method, {}, frames, schedule).image)(stacked)
     history, worst = method.start(jax.device_put(frames[0])), 0.0
     for n, kind in enumerate(schedule.kinds(len(frames[:COMPARED]))):
         frame = jax.device_put(frames[n] if kind == SS else without_color(frames[n]))
-        history, image = steps[kind](variables, history, frame)
+        history, image = steps[kind]({}, history, frame)
         worst = max(worst, float(np.abs(image - unrolled[n]).max()))
     return worst / float(np.abs(unrolled).mean())
 
@@ -114,10 +112,10 @@ def _method_rows(name: str, method: Method, frames: list, dtype: str, options: O
         given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
         with Compilations() as building[kind]:
             history, _ = jax.block_until_ready(steps[kind]({}, history, given))
-    difference = largest_difference(method, steps, {}, frames) if dtype == "float32" else None
+    difference = largest_difference(method, steps, frames) if dtype == "float32" else None
     for resident in (True, False) if jax.default_backend() == "gpu" else (False,):
         with Compilations() as streaming:
-            seconds = stream(method, steps, {}, frames, options.frames, resident=resident)
+            seconds = stream(method, steps, frames, options.frames, resident=resident)
         if streaming.count:
             raise RuntimeError(f"{name}: compiled {streaming.count} times while streaming.")
         for kind in kinds:
@@ -131,7 +129,7 @@ def _method_rows(name: str, method: Method, frames: list, dtype: str, options: O
                 row["difference_from_unrolled"] = difference
             if resident:
                 given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
-                row |= busy(method, steps[kind], {}, given)
+                row |= busy(method, steps[kind], given)
             yield row
 
 

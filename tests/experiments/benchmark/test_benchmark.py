@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from essjax import methods
-from essjax.rollout import SS, stream_step
+from essjax.rollout import SS, bake, stream_step
 from experiments.benchmark import __main__ as command
 from experiments.benchmark import inputs, machine, schema, suites
 from experiments.benchmark.measure import Case, measure, time_calls
@@ -74,10 +74,10 @@ def test_networks_are_those_of_the_methods(forward):
 
 def test_streaming_is_the_unrolled_method_and_compiles_once():
     method, frames = methods.taau(), inputs.frames(3, 40, 32)
-    variables = method.init(jax.random.key(0), frames[0])
+    method = bake(method, method.init(jax.random.key(0), frames[0]))
     steps = {SS: stream_step(method, SS)}
-    assert pipeline.largest_difference(method, steps, variables, frames) < 1e-5
-    seconds = pipeline.stream(method, steps, variables, frames, 5)
+    assert pipeline.largest_difference(method, steps, frames) < 1e-5
+    seconds = pipeline.stream(method, steps, frames, 5)
     assert set(seconds) == {SS} and seconds[SS].shape == (5,) and (seconds[SS] > 0).all()
     assert steps[SS]._cache_size() == 1
 
