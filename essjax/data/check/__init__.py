@@ -75,8 +75,10 @@ class _Checks:
 
 def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
     jitter = [check.jitter for check in checks]
-    against, shift = judge_against(jitter, info.scale)
-    motion = judge_motion([check.motion for check in checks], info, references_jittered=against.fix == FIXES["none"])
+    own = info.source.get("reference") == "color"
+    against, shift = judge_against(jitter, info.scale, own_reference=own)
+    references_jittered = own or against.fix == FIXES["none"]
+    motion = judge_motion([check.motion for check in checks], info, references_jittered=references_jittered)
     motion_wrong = any(finding.verdict == "wrong" for finding in motion)
     return [
         *motion,
@@ -114,13 +116,15 @@ def check_dataset(
 
     Args:
       dataset: from ``read_dataset``.
-      pairs: pairs of neighbouring frames per sequence, evenly spread; 0: all.
+      pairs: pairs of neighbouring frames per sequence, spread over it; 0: all.
       pictures: folder for pictures of the warps, one pair per sequence; None: none.
       progress: called with (frames done, frames in all).
 
     Raises:
-      ValueError: a file is missing or damaged; the message names it.
+      ValueError: a file is missing or damaged, which the message names, or ``pairs`` is negative.
     """
+    if pairs < 0:
+        raise ValueError(f"pairs: expected 0 (all frames) or more, got {pairs}.")
     frames = sum(len(choose(info, pairs)) for info in dataset.sequences.values())
     checks: dict[str, _Checks] = {}
     done = 0

@@ -25,6 +25,8 @@ FAR = 1e6
 """Metres: a finite depth beyond it is a renderer's way to say background."""
 STATIC = 0.1
 """Pixels: motion this close to that of the cameras agrees with it."""
+MOST, HALF = 0.9, 0.5
+"""Shares of the still pixels whose motion must be that of the cameras: below the first odd, below the second wrong."""
 ROWS = ("depth", "cameras", "normals")
 
 
@@ -236,14 +238,15 @@ def _judge_cameras(checks: Sequence[GeometryCheck], depth: Finding, motion_wrong
         return Finding(ROWS[1], "not decidable", f"the {what} is wrong", f"put the {what} right, then check again")
     numbers = {"agreeing": round(1 - off / static, 4)}
     found = f"explain the motion of {1 - off / static:.1%} of the pixels that stand still, to {STATIC} px"
-    if off < 0.5 * static:
+    agreeing, marked = 1 - off / static, all(check.has_stencil for check in checks)
+    if agreeing >= MOST:
         return Finding(ROWS[1], "ok", found, "", numbers)
-    marked = all(check.has_stencil for check in checks)
-    fix = (
+    fix = "" if marked else "nothing marks what moves by itself (stencil): is it that much of the picture? Else: "
+    fix += (
         "is camera_to_world row-major, looking along -Z with y up? focal and center in LR pixels? motion and camera of "
         "the same frame?"
     )
-    return Finding(ROWS[1], "wrong" if marked else "warning", found, fix, numbers)
+    return Finding(ROWS[1], "wrong" if marked and agreeing < HALF else "warning", found, fix, numbers)
 
 
 def _judge_normals(checks: Sequence[GeometryCheck]) -> Finding:

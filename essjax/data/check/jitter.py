@@ -51,6 +51,7 @@ _BORDER = 2
 JITTERED = 0.05
 """LR pixels: frames whose jitter stays below are not jittered."""
 NO_JITTER = "the frames are not jittered"
+OWN_REFERENCE = "the colour is its own reference"
 
 
 def _read(image: Array, positions: Array, axis: int) -> Array:
@@ -194,8 +195,17 @@ def _jittered(checks: Sequence[JitterCheck]) -> bool:
     return max(np.abs(jitter).max() for check in checks for jitter in check.jitters) >= JITTERED
 
 
-def judge_against(checks: Sequence[JitterCheck], scale: int) -> tuple[Finding, Finding]:
-    """Findings about jitter and a constant shift, frames against references."""
+def judge_against(checks: Sequence[JitterCheck], scale: int, *, own_reference: bool = False) -> tuple[Finding, Finding]:
+    """Findings about jitter and a constant shift, frames against references.
+
+    Args:
+      checks: one per sequence.
+      scale: reference size over frame size.
+      own_reference: the references are the frames themselves, so only the jitter's range can be judged.
+    """
+    if own_reference:
+        unknown = Finding(ROWS[0], "not decidable", OWN_REFERENCE if _jittered(checks) else NO_JITTER)
+        return _judge_range(checks) or unknown, Finding(ROWS[2], "not decidable", OWN_REFERENCE)
     surfaces = np.sum([check.against for check in checks], axis=0)
     if not _jittered(checks):
         return Finding(ROWS[0], "not decidable", NO_JITTER), _judge_shift(surfaces[0], scale)

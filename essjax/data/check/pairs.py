@@ -10,6 +10,9 @@ from essjax.data.layout import Dataset, SequenceInfo
 from essjax.data.read import read_sequence
 from essjax.frames import Frame, Sequence, frame_images, select_time
 
+GOLDEN = 0.5 * (5**0.5 - 1)
+"""Multiples of it, modulo 1, fill [0, 1) evenly and have no period."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Step:
@@ -59,10 +62,19 @@ class Step:
 
 
 def choose(info: SequenceInfo, pairs: int) -> list[int]:
-    """Indices of the frames to look at: the first, and up to ``pairs`` later ones, evenly spread; all if 0."""
+    """Indices of the frames to look at: the first, and up to ``pairs`` later ones, spread; all if 0.
+
+    Half of them are odd and half are even, each in its part of the clip at a place that never repeats: even spacing
+    would see only one phase of a jitter that changes every second frame, or of any other period.
+    """
     last = len(info.frames) - 1
     count = min(pairs or last, last)
-    return sorted({0, *np.linspace(1, last, count).round().astype(int).tolist()}) if count > 0 else [0]
+    chosen = [0]
+    for indices, share in ((range(1, last + 1, 2), (count + 1) // 2), (range(2, last + 1, 2), count // 2)):
+        edges = np.linspace(0, len(indices), share + 1).astype(int)
+        places = np.arange(share) * GOLDEN % 1  # in each part, in [0, 1)
+        chosen += [indices[i] for i in (edges[:-1] + places * np.diff(edges)).astype(int)]
+    return sorted(chosen)
 
 
 def _clean(image: np.ndarray, fill: float = 0.0) -> np.ndarray:

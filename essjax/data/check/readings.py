@@ -18,8 +18,9 @@ FIXES = {
     "swapped, x flipped": "motion is stored as (y, -x): exchange X and Y at import, then negate X",
     "swapped, y flipped": "motion is stored as (-y, x): exchange X and Y at import, then negate Y",
     "swapped, both flipped": "motion is stored as (-y, -x): exchange X and Y at import and negate both",
-    "times 2": "motion is too short: multiply it by 2 at import (recipe: scale or unit in [motion])",
-    "times 1/2": "motion is too long: multiply it by 0.5 at import (recipe: scale, unit or resolution in [motion])",
+    "times 2": "motion is too short: multiply it by 2 at import (recipe: scale, unit or encoding in [motion])",
+    "times 1/2": "motion is too long: multiply it by 0.5 at import (recipe: scale, unit, resolution or encoding in "
+    "[motion])",
     "times scale": "motion is too short: multiply it by {scale}, the scale, at import (recipe: scale in [motion])",
     "times 1/scale": "motion is in pixels of the reference: divide it by {scale} at import (recipe: resolution in "
     "[motion])",
@@ -30,6 +31,10 @@ FIXES = {
     "plus jitter": "motion has the jitter in it: add jitter(t) - jitter(t-1) to it at import",
     "minus jitter": "motion has the jitter in it: subtract jitter(t) - jitter(t-1) from it at import (recipe: jittered "
     "in [motion])",
+    "squared (Unreal 5)": "motion is stored as its square root, as Unreal 5 does: decode it at import (recipe: "
+    "encoding 'unreal5' in [motion])",
+    "square root (Unreal 4)": "motion is not stored as its square root: take it as it is at import (recipe: encoding "
+    "'unreal4' in [motion])",
     "none": "motion does not describe the pictures: is it that of another frame (off by one) or of another camera?",
     "of the cameras": "motion is not that of cameras and depth: is it that of another frame (off by one), or without "
     "the camera's part?",
@@ -70,6 +75,8 @@ def motions_of(step: Step) -> dict[str, np.ndarray]:
     times = lambda image, x, y: image * np.array([x, y], np.float32)
     cameras = camera_motion(step)
     missing = np.full_like(motion, np.nan)
+    half = np.array([width / 2, height / 2], np.float32)
+    ndc = motion / half
     result = {
         "as stated": motion,
         "x flipped": times(motion, -1, 1), "y flipped": times(motion, 1, -1), "both flipped": -motion,
@@ -81,6 +88,8 @@ def motions_of(step: Step) -> dict[str, np.ndarray]:
         "times size (UV)": times(motion, width, height),
         "times half size (NDC)": times(motion, width / 2, -height / 2),
         "plus jitter": motion + jitter, "minus jitter": motion - jitter,
+        "squared (Unreal 5)": 0.5 * ndc * np.abs(ndc) * half,
+        "square root (Unreal 4)": np.sign(ndc) * np.sqrt(2 * np.abs(ndc)) * half,
         "none": motion * 0,
         "of the cameras": missing if cameras is None else cameras,
     }  # fmt: skip

@@ -7,6 +7,7 @@ import numpy as np
 
 from essjax.data.check.finding import Finding, some
 from essjax.data.check.pairs import Step
+from essjax.data.exr import HALF_MAX
 from essjax.data.layout import SUFFIXES
 
 UNIT_RANGE = ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive")
@@ -14,8 +15,9 @@ TOLERANCE = 1e-3
 """By which a value may leave its range: half precision."""
 VARIES = ("color", "reference", "base_color", "normal", "depth", "world_position", "motion")
 """Images of which every channel is expected to change; one roughness for a whole scene is nothing odd."""
-CLIPPED = (1.0, 255.0)
-"""Largest values that display-referred pictures have."""
+CLIPPED = {1.0: 1e-4, 255.0: 1e-4, HALF_MAX: 1e-2}
+"""Largest values that display-referred pictures and half-precision files have -> share of values that is too much: a
+few at the end of half are a sun or a lamp."""
 
 
 def channels_of(image: str, count: int) -> list[str]:
@@ -31,7 +33,7 @@ class ValuesCheck:
       bad: kind of defect -> channel -> frames.
       low: channel -> smallest finite value.
       high: channel -> largest finite value.
-      at_top: image -> values of colour and reference that are one of ``CLIPPED``.
+      at_top: image -> values of colour and reference that are in ``CLIPPED``.
       pixels: image -> how many values there are.
     """
 
@@ -66,7 +68,7 @@ class ValuesCheck:
         self.low[channel] = min(self.low.get(channel, np.inf), low)
         self.high[channel] = max(self.high.get(channel, -np.inf), high)
         if image in ("color", "reference"):
-            self.at_top[image] = self.at_top.get(image, 0) + int(np.isin(finite, CLIPPED).sum())
+            self.at_top[image] = self.at_top.get(image, 0) + int(np.isin(finite, list(CLIPPED)).sum())
             self.pixels[image] = self.pixels.get(image, 0) + plane.size
 
 
@@ -117,9 +119,13 @@ def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
     for image in ("color", "reference"):
         high = max(extremes[channel][1] for channel in channels_of(image, 3))
         share = sum(c.at_top[image] for c in checks) / sum(c.pixels[image] for c in checks)
-        if high in CLIPPED and share > 1e-4:
+        if high in CLIPPED and share > CLIPPED[high]:
             found = f"{image} never exceeds {high:g} and is exactly that in {share:.1%} of its values: it looks clipped"
-            fix = "import linear HDR radiance from before tone mapping; if this is 8-bit sRGB, say so at import"
+            fix = (
+                "radiance is beyond what half precision holds: scale it down at import (recipe: color in [scale])"
+                if high == HALF_MAX
+                else "import linear HDR radiance from before tone mapping; if this is 8-bit sRGB, say so at import"
+            )
             return Finding(check, "warning", found, fix, {"max": high, "share": round(share, 4)})
     high = max(extremes[channel][1] for channel in channels_of("color", 3))
     return Finding(check, "ok", f"radiance up to {high:.3g}", "", {"max": high})

@@ -96,6 +96,13 @@ def uv(folder):
     motion(lambda x, y: (x / info.width, y / info.height))(folder)
 
 
+def root(folder):
+    """Unreal 5's texture, read as Unreal 4's: of each axis the square root is left, in units of half the image."""
+    half = np.array([W / 2, H / 2])
+    encode = lambda v, size: np.sign(v) * np.sqrt(2 * np.abs(v) / size) * size
+    motion(lambda x, y: (encode(x, half[0]), encode(y, half[1])))(folder)
+
+
 CONVENTIONS = {
     "x flipped": (
         motion(lambda x, y: (-x, y)),
@@ -112,6 +119,7 @@ CONVENTIONS = {
     "half": (motion(lambda x, y: (x / 2, y / 2)), "motion, references", "multiply it by 2 at import"),
     "swapped": (motion(lambda x, y: (y, x)), "motion, references", "exchange them at import"),
     "UV": (uv, "motion, references", "motion is in UV units: multiply X by"),
+    "Unreal 5": (root, "motion, references", "encoding 'unreal5' in [motion]"),
     "jitter in motion": (
         jitter_in_motion,
         "motion, references",

@@ -13,6 +13,10 @@ import pytest
 
 from essjax.data import exr, read_dataset, read_sequence, write_dataset, write_sequence
 from essjax.data.check import check_dataset
+from essjax.data.check.geometry import GeometryCheck, judge_geometry
+from essjax.data.check.pairs import choose, steps
+from essjax.data.check.values import ValuesCheck, judge_values
+from essjax.data.layout import SequenceInfo
 from tests.data.check.corrupt import (
     CONVENTIONS,
     NAME,
@@ -88,6 +92,67 @@ def test_jittered_references_do_not_blame_motion(good, tmp_path):
     assert "switch the jitter of the reference off" in found["jitter, references"].fix
     assert found["motion, references"].verdict == "not decidable"
     assert found["motion, rendered frames"].verdict == found["jitter, frame to frame"].verdict == "ok"
+
+
+def test_colour_that_is_its_own_reference_says_nothing_about_jitter(good, tmp_path):
+    """An import without references: the same pictures, but nobody can put the references right."""
+    change = lambda sequence: dataclasses.replace(sequence, reference=sequence.frames.color)
+    folder = rewrite(good, tmp_path / "same", change)
+    path = folder / NAME / "sequence.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "source": {"reference": "color"}}))
+    report = check_dataset(read_dataset(folder), pairs=2)
+    found = {finding.check: finding for finding in report.findings}
+    assert report.verdict != "wrong"
+    for row in ("jitter, references", "sub-pixel shift"):
+        assert (found[row].verdict, found[row].found) == ("not decidable", "the colour is its own reference")
+    edit_records(folder, lambda record, _: record.update(jitter=[0.9, 0.0]))
+    assert_wrong(folder, "jitter, references", "in [-0.5, 0.5)", pairs=2)
+
+
+@pytest.mark.parametrize(("frames", "pairs"), [(48, 24), (94, 24), (12, 6), (48, 7)])
+def test_pairs_see_every_phase_of_the_jitter(frames, pairs):
+    """A jitter of period 2, 3, 4 or one that changes every second frame: each of its steps is looked at.
+
+    A third of the pairs that are expected of each phase is the least that counts.
+    """
+    records = tuple({"number": number} for number in range(frames))
+    chosen = choose(SequenceInfo("x", 4, 4, 1, (), False, {}, frames=records), pairs)
+    assert chosen[0] == 0 and len(chosen) == len(set(chosen)) == pairs + 1 and chosen[-1] < frames
+    assert abs(sum(index % 2 for index in chosen[1:]) - pairs / 2) <= 0.5
+    for period in (3, 4, 8) if pairs == 24 else ():
+        phases = np.bincount(np.array(chosen[1:]) % period, minlength=period)
+        assert phases.min() >= pairs / period / 3, phases
+    assert max(np.diff(chosen)) <= 4 * frames / pairs + 2  # nothing is left out for long
+
+
+def test_negative_pairs_are_refused():
+    with pytest.raises(ValueError, match=r"pairs: expected 0 \(all frames\) or more, got -3"):
+        check_dataset(None, pairs=-3)  # type: ignore[arg-type]
+
+
+def test_how_many_pixels_follow_the_cameras():
+    """10 % off may be odd, 35 % is worth a look, 60 % of what is known to stand still is wrong."""
+
+    def judge(off, marked=True):
+        check = GeometryCheck(counts={"static": 1000, "off camera": off}, has_stencil=marked)
+        return judge_geometry([check], motion_wrong=False)[1]
+
+    assert [judge(off).verdict for off in (0, 100, 110, 350, 490, 600)] == ["ok"] * 2 + ["warning"] * 3 + ["wrong"]
+    assert judge(350).fix.startswith("is camera_to_world row-major")
+    assert judge(600, marked=False).verdict == "warning"
+    assert judge(350, marked=False).fix.startswith("nothing marks what moves by itself (stencil)")
+
+
+def test_colour_that_was_clipped_at_the_end_of_half(good):
+    """99 % of radiance in some other unit, flattened at 65504."""
+    check = ValuesCheck()
+    for step in steps(read_dataset(good), NAME, 1):
+        raw = {**step.raw, "color": np.full_like(step.raw["color"], 65504.0)}
+        raw["color"][:4] = 100.0
+        check.add(dataclasses.replace(step, raw=raw))
+    finding = judge_values([check])[2]
+    assert finding.verdict == "warning" and "color never exceeds 65504" in finding.found
+    assert "recipe: color in [scale]" in finding.fix
 
 
 def test_colour_depth_and_motion_alone(good, tmp_path):
