@@ -1,5 +1,6 @@
 """The ``essjax`` command: make, import and check datasets. ``essjax --help`` lists the commands."""
 
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -54,6 +55,15 @@ def parse_range(text: str, option: str) -> tuple[int, int]:
 def parse_split(text: str, option: str) -> tuple[int, int] | list[str]:
     """``"8:19"`` as ``parse_range``; anything without a colon as names of sequences, separated by commas."""
     return parse_range(text, option) if ":" in text else [name.strip() for name in text.split(",")]
+
+
+def _check_folder(path: Path, option: str) -> None:
+    """A ValueError unless files can be written into a folder, or it can be made; before the work that fills it."""
+    there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise ValueError(f"{option}: expected a folder, but {there} is a file.")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ValueError(f"{option}: expected a folder that may be written to, got {path} ({there} may not).")
 
 
 def _print_dataset(dataset: Dataset) -> None:
@@ -123,7 +133,7 @@ _COUNTS = {
 def _print_report(report: ImportReport) -> None:
     _print_dataset(report.dataset)
     totals, table = report.totals, Table(title="conversion", title_justify="left", show_header=False)
-    table.add_row("frames", str(sum(len(info.frames) for info in report.dataset.sequences.values())))
+    table.add_row("frames", str(sum(len(report.dataset.sequences[name].frames) for name in report.imported)))
     table.add_row("background", f"{totals['background'] / totals['pixels']:.1%} of pixels, masked")
     for key, text in _COUNTS.items():
         if key in totals:
@@ -135,7 +145,7 @@ def _print_report(report: ImportReport) -> None:
     _console.print(table)
     for name, frames in report.skipped.items():
         for number, reason in frames.items():
-            text = f"left out, a cut follows: {name}, frame {number}: {reason or 'broken in an earlier run'}"
+            text = f"left out, a cut follows: {name}, frame {number}: {reason}"
             _console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -152,7 +162,8 @@ def import_(
     name: str = "",
     skip_broken: bool = False,
 ) -> None:
-    """Import rendered frames into a dataset, converting their conventions. Interrupted, the same command resumes.
+    """Import rendered frames into a dataset, converting their conventions. Interrupted, the same command resumes; a
+    clip that has grown, or another clip, is added to the dataset.
 
     docs/guides/importing.md has an example of every preset.
 
@@ -164,11 +175,13 @@ def import_(
       reference: Folder with the references, named as the preset's colour, where the dump itself has none.
       train: First and last frame to train on, such as 8:19, or names of sequences, such as a,b; give all three or none
         (60, 10 and 30 % in order, of the sequences if there are three or more).
+        Clips below 10 frames are all test.
       validation: The same, to validate on; streamed from the clip's start.
       test: The same, to test on; streamed from the clip's start.
       name: Name of the sequence; as in the dump if empty.
-      skip_broken: Leave out broken frames (the next one becomes a cut) instead of stopping at them.
+      skip_broken: Leave out broken and missing frames (the next one becomes a cut) instead of stopping at them.
     """
+    _check_folder(out, "OUT")
     given = {"train": train, "validation": validation, "test": test}
     splits = {split: parse_split(text, f"--{split}") for split, text in given.items() if text}
     with progress_bar("importing") as progress:
@@ -219,6 +232,12 @@ def check(
       pictures: Also write pictures to this folder: the previous reference warped, the present one, the difference.
     """
     opened = read_dataset(dataset)
+    if pictures is not None:
+        _check_folder(pictures, "--pictures")
+    if json is not None:
+        if json.is_dir() or not json.parent.is_dir():
+            raise ValueError(f"--json: expected a file in a folder that is there, got {json}.")
+        _check_folder(json.parent, "--json")
     with progress_bar("checking") as progress:
         report = check_dataset(opened, pairs=pairs, pictures=pictures, progress=progress)
     _print_check(report, dataset)
@@ -234,11 +253,16 @@ COMMANDS: dict[str, Callable[..., int | None]] = {"scenes": scenes, "import": im
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; bad input prints one line and returns 2, Ctrl-C returns 130."""
+    """Run a command; bad input and a failing disk print one line and return 2, Ctrl-C returns 130."""
     try:
         code = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv)
     except ValueError as error:
         _console.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        return 2
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        text = f"error: {where}{error.strerror or error}. Is it the right path, may it be used, is the disk full?"
+        _console.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
         _console.print("interrupted; run the same command again to resume.")

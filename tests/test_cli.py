@@ -163,7 +163,7 @@ def test_import_command_of_a_dump_with_a_broken_frame(tmp_path, capsys):
 
 
 def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
-    out = tmp_path / "out"
+    out, others = tmp_path / "out", ["--validation", "11:11", "--test", "12:13"]
     for arguments, message in (
         (["scenes", out, "--size", "128"], "error: --size: expected WIDTHxHEIGHT such as 128x72, got '128'."),
         (["scenes", out, "--size", "0x4"], "error: --size: expected WIDTHxHEIGHT such as 128x72, got '0x4'."),
@@ -174,9 +174,13 @@ def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
             "error: preset: expected one of blender, unreal, extranet, arm-nss, generic, got",
         ),
         (["import", dump, out, "--train", "9:x"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
-        (["import", dump, out, "--train", "9-12"], "error: train: there is no sequence '9-12'; there are clip."),
+        (["import", dump, out, "--train", "8:12"], "error: splits: validation, test missing. Give train, validation"),
         (
-            ["import", dump, out, "--train", "8:20"],
+            ["import", dump, out, "--train", "9-12", *others],
+            "error: train: there is no sequence '9-12'; there are clip. Frames are given as FIRST:LAST, such as 8:19.",
+        ),
+        (
+            ["import", dump, out, "--train", "8:20", *others],
             "error: train: expected first <= last within the frames 8..13, got 8..20.",
         ),
     ):
@@ -191,3 +195,44 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, instant_renderer, monkeypat
     monkeypatch.setattr(essjax.generate, "render_frame", interrupted)
     code, output = run(capsys, "scenes", tmp_path / "out", "--families", "gloss", "--size", "8x6")
     assert code == 130 and "run the same command again to resume" in output
+
+
+def test_a_failing_disk_prints_one_line(tmp_path, capsys, dump, monkeypatch):  # noqa: F811
+    file = tmp_path / "afile"
+    file.touch()
+    assert run(capsys, "import", dump, tmp_path / "ds")[0] == 0
+
+    def denied(path, mode):
+        return False
+
+    cases = (
+        (["import", dump, file], f"error: OUT: expected a folder, but {file} is a file."),
+        (["import", dump, file / "out"], f"error: OUT: expected a folder, but {file} is a file."),
+        (
+            ["check", tmp_path / "ds", "--json", tmp_path / "no" / "x.json"],
+            "error: --json: expected a file in a folder",
+        ),
+        (
+            ["check", tmp_path / "ds", "--json", tmp_path],
+            "error: --json: expected a file in a folder that is there, got",
+        ),
+        (
+            ["check", tmp_path / "ds", "--pictures", file],
+            f"error: --pictures: expected a folder, but {file} is a file.",
+        ),
+    )
+    monkeypatch.setattr(cli, "check_dataset", None)  # all of it before the work
+    for arguments, message in cases:
+        code, output = run(capsys, *arguments)
+        assert code == 2 and message in output and "Traceback" not in output
+    monkeypatch.setattr(cli.os, "access", denied)
+    code, output = run(capsys, "import", dump, tmp_path / "locked" / "out")
+    assert code == 2 and f"OUT: expected a folder that may be written to, got {tmp_path / 'locked'}" in output
+    monkeypatch.undo()
+
+    def unreadable(*arguments, **options):
+        raise PermissionError(13, "Permission denied", "lr.0008.exr")
+
+    monkeypatch.setattr(cli, "import_dataset", unreadable)
+    code, output = run(capsys, "import", dump, tmp_path / "new")
+    assert code == 2 and "error: lr.0008.exr: Permission denied. Is it the right path, may it be used" in output

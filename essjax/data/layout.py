@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from essjax.cameras import Camera
 from essjax.data import exr
 
 SCHEMA = 1
@@ -73,8 +74,10 @@ class SequenceInfo:
       source: where the frames come from, as the producer describes it.
       frames: one record per complete frame, in order: ``number``, ``jitter``, ``cut``, ``exposure``, ``camera``
         (``camera_to_world``, ``focal``, ``center``, or None), ``notes`` (counts); ``native_jitter`` and
-        ``native_camera`` with native.
+        ``native_camera`` with native; ``made_from``, a short text that differs if the frame was made from other files
+        or content.
       complete: false while frames are still to be written.
+      skipped: one record per frame that was left out: ``number``, ``reason`` and ``made_from``.
     """
 
     name: str
@@ -87,6 +90,7 @@ class SequenceInfo:
     frames: tuple[Mapping[str, Any], ...] = ()
     complete: bool = False
     ranges: bool = False
+    skipped: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -180,6 +184,19 @@ def _schema(path: Path, content: dict) -> dict:
     return content
 
 
+def _check_record(where: str, record: Any) -> None:
+    if not isinstance(record, dict) or type(record.get("number")) is not int:
+        raise ValueError(f"{where}: expected a frame with its number, got {str(record)[:60]}. The file is damaged.")
+    expected = {field.name for field in dataclasses.fields(Camera)}
+    for key in ("camera", "native_camera"):
+        camera = record.get(key)
+        if camera is not None and (not isinstance(camera, dict) or set(camera) != expected):
+            found = ", ".join(camera) if isinstance(camera, dict) else repr(camera)
+            raise ValueError(
+                f"{where}, frame {record['number']}: {key}: expected {', '.join(sorted(expected))}, got {found}."
+            )
+
+
 def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
     """Read ``sequence.json`` of a sequence, finished or not.
 
@@ -188,12 +205,17 @@ def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
     """
     path = Path(root) / name / "sequence.json"
     content = _schema(path, read_json(path))
-    content.setdefault("ranges", False)  # datasets older than ranges
+    content = {"ranges": False, "skipped": [], **content}  # datasets older than these
     fields = [field.name for field in dataclasses.fields(SequenceInfo)]
     missing = [field for field in fields if field not in content]
     if missing:
         raise ValueError(f"{path}: the fields {', '.join(missing)} are missing.")
-    content["channels"], content["frames"] = tuple(content["channels"]), tuple(content["frames"])
+    for field in ("channels", "frames", "skipped"):
+        if not isinstance(content[field], list):
+            raise ValueError(f"{path}: {field}: expected a list, got {content[field]!r}.")
+        content[field] = tuple(content[field])
+    for index, record in enumerate((*content["frames"], *content["skipped"])):
+        _check_record(f"{path}, record {index}", record)
     return SequenceInfo(**{field: content[field] for field in fields})
 
 
@@ -220,7 +242,20 @@ def _check_segment(path: Path, split: str, segment: Segment, sequences: Mapping[
         )
 
 
-def _check_agreement(path: Path, infos: Iterable[SequenceInfo]) -> None:
+def check_agreement(path: Path, infos: Iterable[SequenceInfo]) -> None:
+    """A ValueError unless the sequences may be of one dataset: one size, scale, and set of channels."""
+    infos = list(infos)
+    for info in infos:
+        for field in AGREE:
+            if getattr(info, field) != getattr(infos[0], field):
+                raise ValueError(
+                    f"{path}: all sequences must agree in {field}: {infos[0].name} has {getattr(infos[0], field)}, "
+                    f"{info.name} has {getattr(info, field)}. Put them into different datasets: into a folder of their "
+                    "own each, and from there into different output folders."
+                )
+
+
+def _check_sequences(path: Path, infos: Iterable[SequenceInfo]) -> None:
     infos = list(infos)
     for info in infos:
         if not info.complete or not info.frames:
@@ -228,12 +263,7 @@ def _check_agreement(path: Path, infos: Iterable[SequenceInfo]) -> None:
                 f"{path}: sequence {info.name} is unfinished ({len(info.frames)} frames so far). "
                 "Run the command that writes it again: it resumes."
             )
-        for field in AGREE:
-            if getattr(info, field) != getattr(infos[0], field):
-                raise ValueError(
-                    f"{path}: all sequences must agree in {field}: {infos[0].name} has {getattr(infos[0], field)}, "
-                    f"{info.name} has {getattr(info, field)}. Put them into different datasets."
-                )
+    check_agreement(path, infos)
 
 
 def write_dataset(
@@ -255,7 +285,7 @@ def write_dataset(
     sequences = {name: read_sequence_info(root, name) for name in names}
     if not sequences:
         raise ValueError(f"{path}: expected at least one sequence, got none.")
-    _check_agreement(path, sequences.values())
+    _check_sequences(path, sequences.values())
     resolved = {
         split: tuple(whole(sequences[e]) if isinstance(e, str) else Segment(*e) for e in segments)
         for split, segments in entries.items()
@@ -282,6 +312,21 @@ def write_dataset(
     return dataset
 
 
+def read_index(root: str | os.PathLike) -> tuple[list[str], dict[str, Any], dict[str, Any]]:
+    """Names of the sequences, source and splits as ``dataset.json`` has them, be the sequences finished or not.
+
+    Raises:
+      ValueError: the file is missing, damaged, of another schema, or lacks a field.
+    """
+    file = Path(root) / "dataset.json"
+    content = _schema(file, read_json(file))
+    try:
+        names, source, splits = list(content["sequences"]), dict(content["source"]), dict(content["splits"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: a field is missing or has the wrong form ({error!r}).") from error
+    return names, source, splits
+
+
 def read_dataset(path: str | os.PathLike) -> Dataset:
     """Open a dataset: its metadata, checked; images are read by ``read_sequence``.
 
@@ -295,16 +340,15 @@ def read_dataset(path: str | os.PathLike) -> Dataset:
             f"{file}: not found. Expected a finished dataset: make one with `essjax scenes {root}` or "
             f"`essjax import SOURCE {root}` (an interrupted one resumes with the same command)."
         )
-    content = _schema(file, read_json(file))
+    names, source, splits = read_index(root)
     try:
-        names, source, splits = content["sequences"], content["source"], content["splits"]
         resolved = {split: tuple(Segment(**entry) for entry in entries) for split, entries in splits.items()}
-    except (KeyError, TypeError, AttributeError) as error:
+    except (TypeError, AttributeError) as error:
         raise ValueError(f"{file}: a field is missing or has the wrong form ({error!r}).") from error
     sequences = {name: read_sequence_info(root, name) for name in names}
     if not sequences:
         raise ValueError(f"{file}: expected at least one sequence, got none.")
-    _check_agreement(file, sequences.values())
+    _check_sequences(file, sequences.values())
     for split, segments in resolved.items():
         for segment in segments:
             _check_segment(file, split, segment, sequences)

@@ -1,8 +1,8 @@
 """``Sequence``s to a dataset folder, frame by frame."""
 
 import dataclasses
-import json
 import os
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +11,6 @@ import jax
 import numpy as np
 import OpenEXR
 
-from essjax.cameras import Camera
 from essjax.data import exr
 from essjax.data.layout import (
     AGREE,
@@ -20,9 +19,9 @@ from essjax.data.layout import (
     SequenceInfo,
     frame_path,
     read_sequence_info,
-    split_planes,
     write_sequence_info,
 )
+from essjax.data.records import differences, digest, frame_record, plain, planes_of
 from essjax.frames import (
     RANGE_CHANNELS,
     Frame,
@@ -36,39 +35,8 @@ from essjax.frames import (
 
 FAST = {"compression": OpenEXR.RLE_COMPRESSION}
 """For imports, which ZIP would dominate: lossless in a third of its time, for a quarter more disk (path-traced)."""
-
-
-def _plain(content: Any) -> Any:
-    """As JSON gives it back: tuples become lists."""
-    return json.loads(json.dumps(content))
-
-
-def _camera_record(camera: Camera | None) -> dict | None:
-    if camera is None:
-        return None
-    return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in dataclasses.fields(camera)}
-
-
-def _frame_record(number: int, frame: Frame, native: Frame | None) -> dict:
-    record = {
-        "number": number,
-        "jitter": np.asarray(frame.jitter).tolist(),
-        "cut": bool(frame.cut),
-        "exposure": float(frame.exposure),
-        "camera": _camera_record(frame.camera),
-    }
-    if native is not None:
-        record |= {
-            "native_jitter": np.asarray(native.jitter).tolist(),
-            "native_camera": _camera_record(native.camera),
-        }
-    return record
-
-
-def _planes(images: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    return {
-        key: plane for name, image in images.items() for key, plane in split_planes(name, np.asarray(image)).items()
-    }
+DISAGREES = "all frames of a sequence must agree"
+"""Part of the message about a frame of another size or with other channels than those before."""
 
 
 class _Extra(NamedTuple):
@@ -97,7 +65,14 @@ class SequenceWriter:
     """Writes one sequence frame by frame; what is already complete on disk is kept.
 
     A frame counts as complete once ``sequence.json`` lists it, which happens after its images are in place. Opening
-    an unfinished sequence again resumes it; ``number in writer`` says which frames are there.
+    a sequence again resumes it, or goes on behind its last frame; ``number in writer`` says which frames are there.
+
+    A folder that holds images but no ``sequence.json`` was not written here and is refused: it may be somebody's
+    renders.
+
+    Attributes:
+      info: the sequence so far; None before its first frame.
+      skipped: frames that were left out: number -> ``number``, ``reason``, ``made_from``.
     """
 
     def __init__(self, root: str | os.PathLike, name: str, *, source: Mapping[str, Any] | None = None):
@@ -109,24 +84,52 @@ class SequenceWriter:
           source: what makes these frames (settings, seeds); JSON types.
 
         Raises:
-          ValueError: the name is not a folder name, or the sequence there was made from another source.
+          ValueError: the name is not a folder name, the sequence there was made from another source, or the images
+            there are not of a sequence.
         """
         if not name or name != Path(name).name or name.startswith("."):
             raise ValueError(f"sequence name: expected a plain folder name, got {name!r}.")
-        self.root, self.name, self.source = Path(root), name, _plain(dict(source or {}))
+        self.root, self.name, self.source = Path(root), name, plain(dict(source or {}))
         self.info: SequenceInfo | None = None
-        if (self.root / name / "sequence.json").is_file():
-            self.info = read_sequence_info(root, name)
-            self._check_source(self.info.source)
+        self.skipped: dict[int, Mapping[str, Any]] = {}
+        self._mine: set[int] = set()  # frames whose images this writer may remove
+        self._lock = threading.Lock()
+        self._claimed = (self.folder / "sequence.json").is_file()
+        if self._claimed:
+            info = read_sequence_info(root, name)
+            self._check_source(info.source)
+            self.info = info if info.frames else None
+            self.skipped = {record["number"]: record for record in info.skipped}
+        else:
+            self._check_foreign()
+
+    @property
+    def folder(self) -> Path:
+        """Of the sequence."""
+        return self.root / self.name
 
     def _check_source(self, found: Mapping[str, Any]) -> None:
-        keys = [key for key in {**self.source, **found} if self.source.get(key) != found.get(key)]
-        if keys:
-            pairs = "; ".join(f"{key}: asked {self.source.get(key)!r}, found {found.get(key)!r}" for key in keys)
+        if self.source != found:
             raise ValueError(
-                f"{self.root / self.name}: holds frames made with other settings ({pairs}). "
-                "Choose another output folder, or delete this one."
+                f"{self.folder}: holds frames made with other settings "
+                f"({'; '.join(differences(self.source, found))}). Choose another output folder, or delete this one."
             )
+
+    def _check_foreign(self) -> None:
+        for kind in KINDS:
+            for path in sorted(self.folder.glob(f"{kind}.*.exr")):
+                raise ValueError(
+                    f"{self.folder}: expected a new folder or one of an essjax dataset, found images without a "
+                    f"sequence.json ({path.name}, ...), which would be overwritten. Choose another output folder."
+                )
+
+    def _claim(self, described: SequenceInfo) -> None:
+        """Leave a ``sequence.json`` without frames before the first image: what follows is ours, even if killed."""
+        with self._lock:
+            if not self._claimed:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                write_sequence_info(self.root, described)
+                self._claimed = True
 
     def __contains__(self, number: int) -> bool:
         return self.info is not None and number in self.info.numbers
@@ -162,7 +165,7 @@ class SequenceWriter:
             if getattr(info, field) != getattr(described, field):
                 raise ValueError(
                     f"sequence {self.name}, frame {number}: {field} changes from {getattr(info, field)} to "
-                    f"{getattr(described, field)}; all frames of a sequence must agree."
+                    f"{getattr(described, field)}; {DISAGREES}."
                 )
         if info.frames and number != info.numbers[-1] + 1 and not (cut and number > info.numbers[-1]):
             raise ValueError(
@@ -183,7 +186,7 @@ class SequenceWriter:
         ranges: SampleRanges | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Write one frame; nothing happens if it is already complete.
+        """Write one frame. Nothing happens if it is already complete, with the same content.
 
         Args:
           number: original frame number; consecutive, unless the frame is a cut.
@@ -197,28 +200,70 @@ class SequenceWriter:
             that were clamped, is added.
 
         Raises:
-          ValueError: invalid content, or it does not fit to the frames before; names sequence, frame and channel.
+          ValueError: invalid content, it does not fit to the frames before, or the frame is complete with other
+            content (not noticed where an older essjax wrote it); names sequence, frame and channel.
         """
-        if number in self:
-            return
         masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
         extra = _Extra(masks, native, ranges)
         frame, reference, extra = jax.tree.map(np.asarray, (frame, reference, extra))
+        made_from = digest((frame, reference, extra))
+        if self._is_there(number, made_from):
+            return
         self._validate(number, frame, reference, extra)
         self._check_next(number, self._describe(frame, reference, extra), bool(frame.cut))
-        self.commit(self._write_images(number, frame, reference, extra, notes or {}, {}))
+        self.commit(self._write_images(number, frame, reference, extra, notes or {}, {}, made_from))
 
-    def prepare(
-        self, number: int, frame: Frame, reference: Any, *, notes: Mapping[str, Any] | None = None
-    ) -> PreparedFrame:
-        """The first half of ``write``: check a frame and write its images. Threads may prepare frames side by side.
+    def _is_there(self, number: int, made_from: str) -> bool:
+        if number not in self:
+            return False
+        assert self.info is not None
+        found = self.info.frames[self.info.numbers.index(number)].get("made_from", made_from)
+        if found != made_from:
+            raise ValueError(
+                f"{self.folder}: frame {number} is there already, with other content. Choose another name or output "
+                "folder, or delete this one."
+            )
+        return True
+
+    def describe(self, number: int, frame: Frame, reference: Any) -> SequenceInfo:
+        """What a sequence of such frames looks like; nothing is written.
 
         Raises:
           ValueError: invalid content.
         """
         frame, reference = jax.tree.map(np.asarray, (frame, reference))
         self._validate(number, frame, reference, _Extra())
-        return self._write_images(number, frame, reference, _Extra(), notes or {}, FAST)
+        return self._describe(frame, reference, _Extra())
+
+    def prepare(
+        self,
+        number: int,
+        frame: Frame,
+        reference: Any,
+        *,
+        notes: Mapping[str, Any] | None = None,
+        made_from: str = "",
+    ) -> PreparedFrame:
+        """The first half of ``write``: write the images of a frame that ``describe`` accepts.
+
+        Threads may prepare frames side by side.
+
+        Args:
+          number: see ``write``.
+          frame: see ``write``.
+          reference: see ``write``.
+          notes: see ``write``.
+          made_from: what the frame was made from, a short text to recognise a change by.
+
+        Raises:
+          ValueError: the images cannot be written.
+        """
+        frame, reference = jax.tree.map(np.asarray, (frame, reference))
+        return self._write_images(number, frame, reference, _Extra(), notes or {}, FAST, made_from)
+
+    def skip(self, number: int, reason: str, made_from: str) -> None:
+        """Keep in ``sequence.json`` that a frame was left out, why, and what it was made from (see ``prepare``)."""
+        self.skipped[number] = {"number": number, "reason": reason, "made_from": made_from}
 
     def commit(self, prepared: PreparedFrame, *, cut: bool = False, save: bool = True) -> None:
         """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
@@ -237,19 +282,22 @@ class SequenceWriter:
         except ValueError:
             self.discard(prepared.number)
             raise
-        self.info = dataclasses.replace(info, frames=(*info.frames, {**prepared.record, "cut": cut}))
+        frames = (*info.frames, {**prepared.record, "cut": cut})
+        self.info = dataclasses.replace(info, frames=frames, complete=False)
         if save:
             self.save()
 
     def save(self) -> None:
         """Write ``sequence.json``, if there is a frame."""
         if self.info is not None:
+            self.info = dataclasses.replace(self.info, skipped=tuple(self.skipped.values()))
             write_sequence_info(self.root, self.info)
 
     def discard(self, number: int) -> None:
-        """Remove the images of a frame that is not listed."""
-        for kind in KINDS:
-            self._path(kind, number).unlink(missing_ok=True)
+        """Remove the images of a frame that is not listed, if this writer wrote them."""
+        if number in self._mine and number not in self:
+            for kind in KINDS:
+                self._path(kind, number).unlink(missing_ok=True)
 
     def _validate(self, number: int, frame: Frame, reference: np.ndarray, extra: _Extra) -> None:
         where = f"sequence {self.name}, frame {number}"
@@ -258,8 +306,12 @@ class SequenceWriter:
             validate_frame(extra.native, f"{where}, native", ("color",))
         if extra.ranges is not None:
             validate_ranges(extra.ranges, reference.shape[0], reference.shape[1], f"{where}, ranges")
-        if not (np.isfinite(reference).all() and reference.min() >= 0):
-            raise ValueError(f"{where}, reference: expected finite radiance >= 0, got {reference.min()}. Clamp it.")
+        bad = ~(np.isfinite(reference) & (reference >= 0))
+        if bad.any():
+            raise ValueError(
+                f"{where}, reference: expected finite radiance >= 0, got {reference[bad][0]}. "
+                f"{int(bad.sum())} of {bad.size} values are negative, infinite or NaN: clean the frame or clamp them."
+            )
 
     def _write_images(
         self,
@@ -269,22 +321,24 @@ class SequenceWriter:
         extra: _Extra,
         notes: Mapping,
         attributes: Mapping,
+        made_from: str,
     ) -> PreparedFrame:
         described = self._describe(frame, reference, extra)
-        (self.root / self.name).mkdir(parents=True, exist_ok=True)
+        self._claim(described)
+        self._mine.add(number)
         files = {
-            "lr": _planes({**frame_images(frame), **extra.masks}),
+            "lr": planes_of({**frame_images(frame), **extra.masks}),
             "hr": {name: reference[..., i] for i, name in enumerate("RGB")},
         }
         if extra.native is not None:
-            files["native"] = _planes(frame_images(extra.native))
+            files["native"] = planes_of(frame_images(extra.native))
         if extra.ranges is not None:
-            files["ranges"] = _planes({name: getattr(extra.ranges, name) for name in RANGE_CHANNELS})
+            files["ranges"] = planes_of({name: getattr(extra.ranges, name) for name in RANGE_CHANNELS})
         clamped = sum(
             exr.write(self._path(kind, number), planes, attributes=attributes) for kind, planes in files.items()
         )
-        record = _plain({**_frame_record(number, frame, extra.native), "notes": {**notes, "clamped": clamped}})
-        return PreparedFrame(number, described, record)
+        record = frame_record(number, frame, extra.native, made_from) | {"notes": {**notes, "clamped": clamped}}
+        return PreparedFrame(number, described, plain(record))
 
     def _path(self, kind: str, number: int) -> Path:
         return frame_path(self.root, self.name, kind, number)
@@ -292,8 +346,8 @@ class SequenceWriter:
     def finish(self) -> SequenceInfo:
         """Mark the sequence as complete: from now on it can be read."""
         if self.info is None:
-            raise ValueError(f"{self.root / self.name}: expected at least one frame before finish().")
-        if not self.info.complete:
+            raise ValueError(f"{self.folder}: expected at least one frame before finish().")
+        if not self.info.complete or self.info.skipped != tuple(self.skipped.values()):
             self.info = dataclasses.replace(self.info, complete=True)
             self.save()
         return self.info
@@ -304,12 +358,17 @@ def write_sequence(
 ) -> SequenceInfo:
     """Write a whole sequence, leaves ``[T, H, W, C]``; ``write_dataset`` then makes a dataset of it.
 
+    Called again it goes on where it was interrupted, and changes nothing where the sequence is there already.
+
     Args:
       root: the dataset's folder.
       name: of the sequence.
       sequence: without a batch axis.
       first: number of its first frame.
       source: where it comes from.
+
+    Raises:
+      ValueError: invalid content, or a sequence with other frames or of another source is there.
     """
     if sequence.frames.motion.ndim != 4:
         raise ValueError(
@@ -318,7 +377,14 @@ def write_sequence(
         )
     writer = SequenceWriter(root, name, source=source)
     sequence = jax.tree.map(np.asarray, sequence)
-    for index in range(sequence.frames.motion.shape[0]):
+    length = sequence.frames.motion.shape[0]
+    others = [number for number in (writer.info.numbers if writer.info else ()) if not first <= number < first + length]
+    if others:
+        raise ValueError(
+            f"{writer.folder}: holds frame {others[0]}, which is not among the frames {first}..{first + length - 1} to "
+            "write. Choose another name or output folder, or delete this one."
+        )
+    for index in range(length):
         at: Sequence = select_time(sequence, index)
         extra = {name: getattr(at, name) for name in ("valid", "steady", "native", "ranges")}
         writer.write(first + index, at.frames, at.reference, **extra)

@@ -117,7 +117,7 @@ def test_a_range_of_frames_keeps_original_numbers_and_starts_with_a_cut(tmp_path
 
 
 def test_an_interrupted_sequence_resumes_and_keeps_complete_frames(tmp_path):
-    """The second writer is given different pixels: frames 3 and 4 must be the first writer's, 5 and 6 the second's."""
+    """The second writer has different pixels: frames 3 and 4 must be the first writer's, 5 and 6 the second's."""
     first, second = sequence(0, T=4), sequence(1, T=4)
     source = {"seed": 1, "size": (9, 6)}
     write_frames(SequenceWriter(tmp_path, "a", source=source), first, [3, 4], 3)
@@ -125,7 +125,10 @@ def test_an_interrupted_sequence_resumes_and_keeps_complete_frames(tmp_path):
         write_dataset(tmp_path, {"train": ["a"]})
     writer = SequenceWriter(tmp_path, "a", source=source)
     assert [n in writer for n in (3, 4, 5)] == [True, True, False] and not writer.complete
-    write_frames(writer, second, [3, 4, 5, 6], 3)
+    write_frames(writer, first, [3, 4], 3)
+    with pytest.raises(ValueError, match=r"a: frame 4 is there already, with other content\. Choose another name or"):
+        write_frames(writer, second, [4], 3)
+    write_frames(writer, second, [5, 6], 3)
     writer.finish()
     assert SequenceWriter(tmp_path, "a", source=source).complete
     back = read_sequence(write_dataset(tmp_path, {"train": ["a"]}), "a")
@@ -164,6 +167,58 @@ def test_other_settings_do_not_resume(tmp_path):
         SequenceWriter(tmp_path, "a", source={"seed": 1, "spp": 64})
 
 
+def test_a_sequence_that_is_there_does_not_change(tmp_path):
+    written = sequence(T=4)
+    info = write_sequence(tmp_path, "a", written, first=8)
+    assert write_sequence(tmp_path, "a", written, first=8) == info
+    negated = dataclasses.replace(written, frames=dataclasses.replace(written.frames, motion=-written.frames.motion))
+    with pytest.raises(ValueError, match=r"a: frame 8 is there already, with other content\. Choose another name"):
+        write_sequence(tmp_path, "a", negated, first=8)
+    with pytest.raises(ValueError, match=r"holds frame 8, which is not among the frames 9\.\.12 to write"):
+        write_sequence(tmp_path, "a", written, first=9)
+    longer = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[1:2]]), written)
+    assert write_sequence(tmp_path, "a", longer, first=8).numbers == (8, 9, 10, 11, 12)
+    path = tmp_path / "a" / "sequence.json"  # as written before frames said what they were made from
+    content = json.loads(path.read_text())
+    for record in content["frames"]:
+        del record["made_from"]
+    del content["skipped"]
+    path.write_text(json.dumps(content))
+    dataset = write_dataset(tmp_path, {"train": ["a"]})
+    assert_close(read_sequence(dataset, "a"), longer)
+    assert write_sequence(tmp_path, "a", longer, first=8).numbers == (8, 9, 10, 11, 12)
+
+
+def test_images_of_others_are_neither_overwritten_nor_deleted(tmp_path):
+    (tmp_path / "a").mkdir()
+    theirs = tmp_path / "a" / "hr.0001.exr"
+    theirs.write_bytes(b"a render")
+    with pytest.raises(
+        ValueError, match=r"found images without a sequence\.json \(hr\.0001\.exr, \.\.\.\), which would be"
+    ):
+        write_sequence(tmp_path, "a", sequence())
+    assert theirs.read_bytes() == b"a render"
+    writer = SequenceWriter(tmp_path, "b")
+    write_frames(writer, sequence(), [0], 0)
+    late = theirs.rename(tmp_path / "b" / "hr.0001.exr")
+    writer.discard(1)
+    assert late.exists()
+
+
+def test_a_writer_that_dies_in_its_first_frame_leaves_a_folder_of_its_own(tmp_path, monkeypatch):
+    def dies(*arguments, **options):
+        (tmp_path / "a" / "lr.0000.exr").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(exr, "write", dies)
+    with pytest.raises(KeyboardInterrupt):
+        write_sequence(tmp_path, "a", sequence())
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=r"sequence a is unfinished \(0 frames so far\)"):
+        write_dataset(tmp_path, {"train": ["a"]})
+    assert write_sequence(tmp_path, "a", sequence()).complete
+
+
 def test_frames_must_follow_each_other(tmp_path):
     source = sequence(T=3)
     writer = SequenceWriter(tmp_path, "a")
@@ -189,6 +244,12 @@ def test_invalid_content_is_refused_with_names(tmp_path):
         writer.write(7, at.frames, at.reference[:, :-1])
     with pytest.raises(ValueError, match=r"sequence a, frame 7, reference: expected finite radiance >= 0, got -1\."):
         writer.write(7, at.frames, at.reference - 1.0 - at.reference)
+    for bad in (np.inf, np.nan):
+        reference = at.reference.copy()
+        reference[0, 1, 2] = bad
+        match = rf"frame 7, reference: expected finite radiance >= 0, got {bad}\. 1 of {reference.size} values are"
+        with pytest.raises(ValueError, match=match):
+            writer.write(7, at.frames, reference)
     with pytest.raises(ValueError, match="frame 7 needs the buffers color"):
         writer.write(7, dataclasses.replace(at.frames, color=None), at.reference)
     with pytest.raises(ValueError, match="expected at least one frame before finish"):
@@ -242,6 +303,20 @@ def test_damaged_metadata_is_named(dataset_on_disk):
     sequence_json.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"sequence\.json, frame 9: 'jitter' is missing"):
         read_sequence(read_dataset(root), "a")
+    content["frames"][1]["jitter"] = [0.0, 0.0]
+    content["frames"][2]["camera"]["fov"] = 1.0
+    sequence_json.write_text(json.dumps(content))
+    with pytest.raises(
+        ValueError, match=r"record 2, frame 10: camera: expected camera_to_world, center, focal, got .*fov"
+    ):
+        read_dataset(root)
+    del content["frames"][1]["number"]
+    sequence_json.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"sequence\.json, record 1: expected a frame with its number, got {'"):
+        read_dataset(root)
+    sequence_json.write_text(json.dumps({**content, "frames": 3}))
+    with pytest.raises(ValueError, match=r"sequence\.json: frames: expected a list, got 3"):
+        read_dataset(root)
     sequence_json.write_text(json.dumps({"schema": 1}))
     with pytest.raises(ValueError, match=r"sequence\.json: the fields name, width, .* are missing"):
         read_dataset(root)

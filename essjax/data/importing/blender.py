@@ -74,6 +74,11 @@ def _read_meta(folder: Path) -> _Dump:
         raise ValueError(f"{path}: a field has the wrong form ({error}).") from error
     if not cameras:
         raise ValueError(f"{path}: expected at least one frame under 'frames', got none.")
+    if not all(isinstance(size, int) and size > 0 for size in (width, height, wide, high)):
+        raise ValueError(
+            f"{path}: expected render_size and display_size in whole pixels, above 0, got {[width, height]} and "
+            f"{[wide, high]}."
+        )
     if (wide, high) != (width * (wide // width), height * (wide // width)):
         raise ValueError(
             f"{path}: expected display_size to be a whole multiple of render_size, got {wide}x{high} and "
@@ -282,7 +287,18 @@ class BlenderClip:
     @property
     def source(self) -> dict[str, Any]:
         """What the dataset keeps."""
-        return {"preset": "blender", "frames": [self.numbers[0], self.numbers[-1]], "dynamic": list(self.dynamic)}
+        return {"preset": "blender", "folder": str(self.dump.folder.resolve()), "dynamic": list(self.dynamic)}
+
+    def files(self, number: int) -> list[Path]:
+        """Of one frame."""
+        return [self.dump.folder / f"{kind}.{number:04d}.exr" for kind in ("lr", "hr")]
+
+    def said(self, number: int) -> str:
+        """What ``meta.json`` says that matters to one frame."""
+        dump = self.dump
+        camera, previous = dump.cameras[number], dump.cameras.get(number - 1)
+        size = (dump.width, dump.height, dump.scale)
+        return repr((size, camera, previous, dump.jitters[number].tolist()))
 
     def convert(self, number: int) -> Converted:
         """Read and convert one frame; a ValueError names the file and what is missing or wrong."""

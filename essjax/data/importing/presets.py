@@ -1,22 +1,34 @@
 """The presets by name, and the import itself: open the dump, write its clips, then ``dataset.json``."""
 
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from essjax.data.importing.arm import arm_facts
-from essjax.data.importing.blender import open_blender
-from essjax.data.importing.dump import MakeFacts, open_dump
+from essjax.data.importing.blender import BlenderClip, open_blender
+from essjax.data.importing.dump import MakeFacts, RecipeClip, open_dump
 from essjax.data.importing.facts import Facts, generic_facts, no_facts
 from essjax.data.importing.files import fill
+from essjax.data.importing.inputs import files_of, made_from
 from essjax.data.importing.recipe import Recipe, load_recipe
 from essjax.data.importing.splits import Range, fit_segments, split_segments
-from essjax.data.importing.stream import Clip, OnFrame, Written, write_clip
+from essjax.data.importing.stream import OnFrame, Written, open_clip, write_clip
 from essjax.data.importing.unreal import header_facts
-from essjax.data.layout import Dataset, SequenceInfo, write_dataset
+from essjax.data.layout import (
+    Dataset,
+    SequenceInfo,
+    check_agreement,
+    read_index,
+    read_sequence_info,
+    write_dataset,
+)
+from essjax.data.store import SequenceWriter
 
 PRESETS = ("blender", "unreal", "extranet", "arm-nss", "generic")
+Clip = BlenderClip | RecipeClip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,17 +40,19 @@ class ImportReport:
       totals: counts over all frames: ``pixels`` (LR), ``background`` pixels, ``negative`` colour values set to 0,
         ``clamped`` values beyond half's range; ``mixed`` silhouette pixels of static objects whose motion was taken
         from the cameras (blender); ``unwritten`` pixels likewise (unreal); ``infinite`` colour values.
-      skipped: sequence -> broken frame -> what is wrong with it ("" if an earlier, interrupted run found out).
+      skipped: sequence -> broken frame -> what is wrong with it, or first frame of a gap -> which frames are missing.
+      imported: the sequences of this import; the dataset may hold others, imported before.
     """
 
     dataset: Dataset
     totals: Mapping[str, int]
     skipped: Mapping[str, Mapping[int, str]]
+    imported: tuple[str, ...]
 
     @property
     def sequence(self) -> SequenceInfo:
-        """The first sequence."""
-        return self.dataset.info
+        """The first sequence of this import."""
+        return self.dataset.sequences[self.imported[0]]
 
     @property
     def dynamic(self) -> tuple[int, ...]:
@@ -72,7 +86,10 @@ def _open(
             f"{source}: {len(missing)} of the images are missing, the first is {missing[0]}. Dump or copy them; "
             "--skip-broken leaves their frames out."
         )
-    return clips
+    folders = {"folder": str(source.resolve())}
+    if reference is not None:
+        folders["reference_folder"] = str(reference.resolve())
+    return [dataclasses.replace(clip, source={**clip.source, **folders}) for clip in clips]
 
 
 def import_dataset(
@@ -88,7 +105,10 @@ def import_dataset(
     workers: int | None = None,
     on_frame: OnFrame = lambda done, total: None,
 ) -> ImportReport:
-    """Import a dump into a dataset; running it again resumes where it was interrupted.
+    """Import a dump into a dataset; running it again resumes where it was interrupted, or adds what is new.
+
+    New are frames behind the last one, and sequences: those that the dataset holds already stay, and the splits are
+    made again of all. What is there was made from the same files by the same recipe, or the import is refused.
 
     Args:
       source: the dump's folder.
@@ -103,7 +123,8 @@ def import_dataset(
       on_frame: called with (frames done, frames in all).
 
     Raises:
-      ValueError: names the file and what is missing or wrong.
+      ValueError: names the file and what is missing or wrong, or what ``out`` holds that does not fit.
+      OSError: a file cannot be read or written.
     """
     if preset not in PRESETS:
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
@@ -113,13 +134,97 @@ def import_dataset(
         if len(clips) > 1:
             raise ValueError(f"name: the dump has {len(clips)} sequences, which keep their names. Leave it out.")
         clips = [dataclasses.replace(clips[0], name=name)]  # type: ignore[type-var]
-    segments = split_segments({clip.name: clip.numbers for clip in clips}, splits)
+    gaps = {clip.name: _gaps(clip.name, clip.numbers, skip_broken) for clip in clips}
+    kept, about = _kept(Path(out), preset, clips, splits)
+    numbers = {name: info.numbers for name, info in kept.items()}
+    segments = split_segments({**numbers, **{clip.name: clip.numbers for clip in clips}}, splits)
+    _check_out(Path(out), clips, kept, skip_broken)
     written = _write(out, clips, skip_broken, workers, on_frame)
-    skipped = {clip: part.skipped for clip, part in written.items() if part.skipped}
-    numbers = {clip: part.info.numbers for clip, part in written.items()}
-    about = {"preset": preset, "skipped": {clip: sorted(frames) for clip, frames in skipped.items()}}
+    numbers |= {name: part.info.numbers for name, part in written.items()}
+    skipped = {name: {**gaps[name], **part.skipped} for name, part in written.items()}
+    skipped = {name: dict(sorted(frames.items())) for name, frames in skipped.items() if frames}
+    before = {name: frames for name, frames in about.get("skipped", {}).items() if name in kept}
+    about = {
+        "preset": preset,
+        "skipped": {**before, **{name: list(frames) for name, frames in skipped.items()}},
+        "splits": None if splits is None else {split: list(chosen) for split, chosen in splits.items()},
+    }
     dataset = write_dataset(out, fit_segments(segments, numbers), source=about)
-    return ImportReport(dataset, _totals([part.info for part in written.values()]), skipped)
+    return ImportReport(dataset, _totals([part.info for part in written.values()]), skipped, tuple(written))
+
+
+def _gaps(name: str, numbers: Sequence[int], skip_broken: bool) -> dict[int, str]:
+    """First missing number -> which are missing. A ValueError if none may be, or no two are neighbours."""
+    pairs = list(zip(numbers, numbers[1:], strict=False))
+    spans = [(a + 1, b - 1) for a, b in pairs if b > a + 1]
+    gaps = {a: f"frame {a} is missing" if a == b else f"the frames {a}..{b} are missing" for a, b in spans}
+    shown = ", ".join(map(str, numbers[:4])) + (", ..." if len(numbers) > 4 else "")
+    if pairs and len(gaps) == len(pairs):
+        raise ValueError(
+            f"sequence {name}: expected frames that follow each other, got {shown}: every one would be a cut. Motion "
+            "links a frame to the one before; number them in steps of 1."
+        )
+    if gaps and not skip_broken:
+        raise ValueError(
+            f"sequence {name}: {next(iter(gaps.values()))}, and {len(gaps) - 1} more gaps follow. Render or copy "
+            "what is missing; --skip-broken goes on without, with a cut behind each gap."
+        )
+    return gaps
+
+
+def _kept(
+    out: Path, preset: str, clips: Sequence[Clip], splits: Mapping[str, Range] | None
+) -> tuple[dict[str, SequenceInfo], Mapping[str, Any]]:
+    """Sequences that ``out`` holds besides those of this import, and the source of its dataset."""
+    if not (out / "dataset.json").exists():
+        return {}, {}
+    names, about, _ = read_index(out)
+    if about.get("preset") != preset:
+        made = f"the preset {about['preset']}" if "preset" in about else "another command"
+        raise ValueError(
+            f"{out}: expected a dataset of the preset {preset}, found one of {made}. Choose another folder."
+        )
+    kept = {name: read_sequence_info(out, name) for name in names if name not in {clip.name for clip in clips}}
+    for name, info in kept.items():
+        if not info.complete:
+            raise ValueError(f"{out}: sequence {name} is unfinished. First run the import that writes it again.")
+    if splits is None and about.get("splits") and {clip.name for clip in clips} - set(names):
+        given = ", ".join(f"--{split} {chosen}" for split, chosen in about["splits"].items())
+        raise ValueError(
+            f"{out}: the splits of this dataset were chosen ({given}). Say what they are with the new sequence: give "
+            "train, validation and test."
+        )
+    return kept, about
+
+
+def _check_out(out: Path, clips: Sequence[Clip], kept: Mapping[str, SequenceInfo], skip_broken: bool) -> None:
+    """Refuse what cannot end well before anything is written."""
+    infos = list(kept.values())
+    for clip in clips:
+        folder = (out / clip.name).resolve()
+        for parent in {path.parent for number in clip.numbers for path in files_of(clip, number)}:
+            if parent.resolve() == folder:
+                raise ValueError(
+                    f"{folder}: the dump is there, nothing is written into it. Choose another output folder."
+                )
+        writer, _ = open_clip(out, clip, functools.partial(made_from, clip))
+        if len(clips) + len(kept) > 1:
+            infos.append(writer.info or _first_frame(clip, writer, skip_broken))
+    check_agreement(out / "dataset.json", infos)
+
+
+def _first_frame(clip: Clip, writer: SequenceWriter, skip_broken: bool) -> SequenceInfo:
+    """What the first frame that is not broken says about size and channels."""
+    reasons = []
+    for number in clip.numbers:
+        try:
+            converted = clip.convert(number)
+            return writer.describe(number, converted.frame, converted.reference)
+        except ValueError as error:
+            reasons.append(f"sequence {clip.name}, frame {number}: {error}")
+            if not skip_broken:
+                raise ValueError(f"{reasons[0]} (--skip-broken leaves such frames out.)") from error
+    raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {reasons[0]}")
 
 
 def _write(
@@ -132,9 +237,11 @@ def _write(
         done += count
         on_frame(done, total)
 
-    return {
-        clip.name: write_clip(out, clip, skip_broken=skip_broken, workers=workers, on_frames=step) for clip in clips
-    }
+    def write(clip: Clip) -> Written:
+        known = functools.partial(made_from, clip)
+        return write_clip(out, clip, made_from=known, skip_broken=skip_broken, workers=workers, on_frames=step)
+
+    return {clip.name: write(clip) for clip in clips}
 
 
 def _totals(infos: Sequence[SequenceInfo]) -> dict[str, int]:

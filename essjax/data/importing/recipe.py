@@ -161,11 +161,14 @@ class Recipe:
         return self.files.get(image, default or self.files.get("frame", ""))
 
     def record(self) -> dict[str, Any]:
-        """What of it a dataset keeps: how its motion, depth, jitter and colour came about."""
-        kept = ("motion", "depth", "jitter", "color")
-        rules = {name: dataclasses.asdict(getattr(self, name)) for name in kept}
-        plain = {name: {k: str(v) if v == float("inf") else v for k, v in rule.items()} for name, rule in rules.items()}
-        return plain
+        """All of it, as a dataset keeps it: JSON types."""
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: plain(item) for key, item in value.items()}
+            return str(value) if value == float("inf") else value
+
+        return plain(dataclasses.asdict(self))
 
 
 _TABLES = {

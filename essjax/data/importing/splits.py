@@ -1,9 +1,11 @@
 """Training, validation and test ranges of imported clips."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 from essjax.data.layout import Segment
 
+SPLITS = ("train", "validation", "test")
 Range = tuple[int, int] | Sequence[str]
 """Numbers of the first and the last frame, both included, or names of sequences."""
 
@@ -26,12 +28,15 @@ def split_segments(clips: Mapping[str, Sequence[int]], wanted: Mapping[str, Rang
 
     Args:
       clips: sequence -> the numbers of its frames.
-      wanted: split -> frames of every sequence, or names of sequences. None: with three sequences or more whole
-        sequences (60, 10 and 30 %, at least one each), else ``default_splits`` of each.
+      wanted: all of "train", "validation" and "test" -> frames of every sequence, or names of sequences. None: with
+        three sequences or more whole sequences (60, 10 and 30 %, at least one each), else ``default_splits`` of each.
 
     Raises:
-      ValueError: a range lies outside, or a name is unknown.
+      ValueError: a split is missing, a range lies outside, a name is unknown, or two splits share a frame.
     """
+    missing = [split for split in SPLITS if not (wanted is None or wanted.get(split))]
+    if missing:
+        raise ValueError(f"splits: {', '.join(missing)} missing. Give train, validation and test, or none of them.")
     if wanted is None and len(clips) >= 3:
         wanted = _by_sequence(list(clips))
     segments: dict[str, list[Segment]] = {}
@@ -46,8 +51,28 @@ def split_segments(clips: Mapping[str, Sequence[int]], wanted: Mapping[str, Rang
     for split, chosen in (wanted or {}).items():
         unknown = [name for name in chosen if isinstance(name, str) and name not in clips]
         if unknown:
-            raise ValueError(f"{split}: there is no sequence {unknown[0]!r}; there are {', '.join(clips)}.")
+            raise ValueError(
+                f"{split}: there is no sequence {unknown[0]!r}; there are {', '.join(clips)}. Frames are given as "
+                "FIRST:LAST, such as 8:19."
+            )
+    _check_overlap(segments)
     return segments
+
+
+def _check_overlap(segments: Mapping[str, Sequence[Segment]]) -> None:
+    """Warm-up may run over frames of another split; what is trained on or scored may not."""
+    scored: dict[str, list[tuple[str, Segment]]] = {}
+    for split, part in segments.items():
+        for segment in part:
+            scored.setdefault(segment.sequence, []).append((split, segment))
+    for mine in scored.values():
+        for (other, a), (split, b) in itertools.combinations(mine, 2):
+            first, last = max(a.score_from, b.score_from), min(a.last, b.last)
+            if split != other and first <= last:
+                raise ValueError(
+                    f"splits: {other} and {split} share the frames {first}..{last} of {a.sequence}. A frame that is "
+                    "trained on says nothing in a test: choose ranges that do not overlap."
+                )
 
 
 def _by_sequence(names: list[str]) -> dict[str, list[str]]:

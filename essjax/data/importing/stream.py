@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from essjax.data.layout import SequenceInfo
-from essjax.data.store import PreparedFrame, SequenceWriter
+from essjax.data.store import DISAGREES, PreparedFrame, SequenceWriter
 from essjax.frames import Frame
 
 SAVE_EVERY = 16
@@ -56,76 +56,155 @@ class Clip(Protocol):
         ...
 
 
+MadeFrom = Callable[[int], str]
+"""Number of a frame -> a short text that changes if what the frame is made from does."""
+
+
+class BrokenFrame(ValueError):
+    """A frame that cannot be used, whatever the disk: ``--skip-broken`` leaves it out."""
+
+    def __init__(self, reason: str, made_from: str):
+        super().__init__(reason)
+        self.made_from = made_from
+
+
 class Written(NamedTuple):
-    """A finished sequence, and broken frame -> what is wrong with it; "" if an earlier run found out."""
+    """A finished sequence, and broken frame -> what is wrong with it."""
 
     info: SequenceInfo
     skipped: Mapping[int, str]
+
+
+def open_clip(
+    root: str | os.PathLike, clip: Clip, made_from: MadeFrom = lambda number: ""
+) -> tuple[SequenceWriter, list[int]]:
+    """The writer of a clip's sequence, and the frames that are still to be written; nothing is written yet.
+
+    A sequence may be there: part of the clip, all of it, or all but the frames that were rendered since. Broken frames
+    behind its last frame are tried again.
+
+    Args:
+      root: the dataset's folder.
+      clip: the frames.
+      made_from: of each frame.
+
+    Raises:
+      ValueError: the sequence there was made in another way or from other frames, which a second import cannot mend.
+    """
+    writer = SequenceWriter(root, clip.name, source=clip.source)
+    if writer.info is None:
+        return writer, list(clip.numbers)
+    last, numbers = writer.info.numbers[-1], set(clip.numbers)
+    known = {record["number"]: record for record in (*writer.info.skipped, *writer.info.frames)}
+    for number, record in known.items():
+        if number not in numbers and "reason" not in record:
+            _refuse(writer, f"frame {number} was imported before, and is not there any more")
+        if number in numbers and number <= last and record.get("made_from") != made_from(number):
+            was = f", left out as broken ({record['reason']})," if "reason" in record else ""
+            _refuse(writer, f"frame {number}{was} was changed since the import before: its files or its metadata")
+    writer.skipped = {number: record for number, record in writer.skipped.items() if number in numbers}
+    between = [number for number in clip.numbers if number < last and number not in known]
+    if between:
+        _refuse(writer, f"frame {between[0]} was not there at the import before, but frame {last} was")
+    return writer, [number for number in clip.numbers if number > last]
+
+
+def _refuse(writer: SequenceWriter, what: str) -> None:
+    raise ValueError(
+        f"{writer.folder}: {what}. An import only goes on behind the last frame: delete that folder, or choose another "
+        "output folder, and import again."
+    )
 
 
 def write_clip(
     root: str | os.PathLike,
     clip: Clip,
     *,
+    made_from: MadeFrom = lambda number: "",
     skip_broken: bool = False,
     workers: int | None = None,
     on_frames: Callable[[int], Any] = lambda count: None,
 ) -> Written:
-    """Convert a clip into a finished sequence; resumes behind the last frame that is there.
+    """Convert a clip into a finished sequence; goes on behind the last frame that is there, see ``open_clip``.
 
     Memory holds ``2 * workers`` frames, whatever the clip's length.
 
     Args:
       root: the dataset's folder.
       clip: the frames.
+      made_from: of each frame.
       skip_broken: leave broken frames out; the next one becomes a cut. They stop the import otherwise.
       workers: threads; None: one per core.
       on_frames: called with the number of frames that are done since the last call.
 
     Raises:
-      ValueError: a frame is broken (and ``skip_broken`` is off), or no frame is left.
+      ValueError: as ``open_clip``; a frame is broken (and ``skip_broken`` is off); no frame is left, or most differ
+        from the first in size or channels; a file cannot be written.
+      OSError: a file cannot be read or written.
     """
-    writer = SequenceWriter(root, clip.name, source=clip.source)
-    last = writer.info.numbers[-1] if writer.info else clip.numbers[0] - 1
-    pending = [] if writer.complete else [number for number in clip.numbers if number > last]
+    writer, pending = open_clip(root, clip, made_from)
     on_frames(len(clip.numbers) - len(pending))
-    reasons: dict[int, str] = {}
-    with closing(_prepared(clip, writer, pending, workers or os.cpu_count() or 1)) as frames, _saved_at_last(writer):
+    frames = _prepared(clip, writer, pending, made_from, workers or os.cpu_count() or 1)
+    with closing(frames), _saved_at_last(writer):
         for index, (number, future) in enumerate(frames):
             try:
-                cut = writer.info is None or writer.info.numbers[-1] != number - 1
-                writer.commit(future.result(), cut=cut, save=index % SAVE_EVERY == 0)
-            except ValueError as error:
-                writer.discard(number)
+                _commit(writer, number, future, save=index % SAVE_EVERY == 0)
+            except BrokenFrame as error:
                 if not skip_broken:
                     message = f"sequence {clip.name}, frame {number}: {error} (--skip-broken leaves such frames out.)"
                     raise ValueError(message) from error
-                reasons[number] = str(error)
+                writer.skip(number, str(error), error.made_from)
             on_frames(1)
+    skipped = {number: writer.skipped[number]["reason"] for number in sorted(writer.skipped)}
     if writer.info is None:
-        raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {next(iter(reasons.values()))}")
-    info = writer.finish()
-    left_out = sorted(set(clip.numbers) - set(info.numbers))
-    return Written(info, {number: reasons.get(number, "") for number in left_out})
+        raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {next(iter(skipped.values()))}")
+    others = [reason for reason in skipped.values() if DISAGREES in reason]
+    if len(others) > len(writer.info.frames):
+        raise ValueError(
+            f"{len(others)} frames are not like the {len(writer.info.frames)} at the beginning: {others[0]} Remove or "
+            f"replace the wrong ones, delete {writer.folder}, and import again."
+        )
+    return Written(writer.finish(), skipped)
+
+
+def _commit(writer: SequenceWriter, number: int, future: Future[PreparedFrame], *, save: bool) -> None:
+    prepared = future.result()
+    cut = writer.info is None or writer.info.numbers[-1] != number - 1
+    try:
+        writer.commit(prepared, cut=cut, save=save)
+    except ValueError as error:
+        raise BrokenFrame(str(error), prepared.record["made_from"]) from error
+    writer.skipped.pop(number, None)
 
 
 @contextmanager
 def _saved_at_last(writer: SequenceWriter) -> Iterator[None]:
     """However it ends, the frames so far are listed."""
+    before = writer.info
     try:
         yield
     finally:
-        writer.save()
+        if writer.info is not before:
+            writer.save()
 
 
 def _prepared(
-    clip: Clip, writer: SequenceWriter, numbers: list[int], workers: int
+    clip: Clip, writer: SequenceWriter, numbers: list[int], made_from: MadeFrom, workers: int
 ) -> Generator[tuple[int, Future[PreparedFrame]], None, None]:
     """Frames whose images are written, in order, ``2 * workers`` on their way."""
 
     def work(number: int) -> PreparedFrame:
-        converted = clip.convert(number)
-        return writer.prepare(number, converted.frame, converted.reference, notes=converted.counts)
+        before = made_from(number)  # a file that changes while it is read counts as changed
+        try:
+            frame, reference, counts = clip.convert(number)
+            writer.describe(number, frame, reference)
+        except ValueError as error:
+            raise BrokenFrame(str(error), before) from error
+        try:
+            return writer.prepare(number, frame, reference, notes=counts, made_from=before)
+        except BaseException:
+            writer.discard(number)
+            raise
 
     waiting: deque[tuple[int, Future[PreparedFrame]]] = deque()
     with ThreadPoolExecutor(workers) as pool:

@@ -210,10 +210,14 @@ def test_splits(dump, tmp_path):
     assert default_splits(8, 27) == {"train": (8, 19), "validation": (20, 21), "test": (22, 27)}
     assert default_splits(0, 9) == {"train": (0, 5), "validation": (6, 6), "test": (7, 9)}
     assert default_splits(3, 7) == {"test": (3, 7)}
-    ranges = {"train": (8, 10), "test": (11, 13)}
+    ranges = {"train": (8, 10), "validation": (11, 11), "test": (12, 13)}
     report = import_dataset(dump, tmp_path / "out", "blender", splits=ranges, name="board")
     assert read_dataset(tmp_path / "out").splits == report.dataset.splits
-    assert report.dataset.splits == {"train": (("board", 8, 10, 8),), "test": (("board", 8, 13, 11),)}
+    assert report.dataset.splits == {
+        "train": (("board", 8, 10, 8),),
+        "validation": (("board", 8, 11, 11),),
+        "test": (("board", 8, 13, 12),),
+    }
     assert read_segment(report.dataset, report.dataset.splits["test"][0]).frames.motion.shape[0] == 6
 
 
@@ -234,8 +238,17 @@ def test_an_interrupted_import_resumes_to_the_same_report(dump, tmp_path):
 
 def test_a_gap_in_the_numbers_is_a_cut(tmp_path):
     folder = write_dump(tmp_path / "clip", numbers=[8, 9, 12, 13])
-    report = import_dataset(folder, tmp_path / "out", "blender")
+    with pytest.raises(
+        ValueError, match=r"sequence clip: the frames 10\.\.11 are missing, and 0 more gaps follow\. Render"
+    ):
+        import_dataset(folder, tmp_path / "out", "blender")
+    assert not (tmp_path / "out").exists()
+    report = import_dataset(folder, tmp_path / "out", "blender", skip_broken=True)
     np.testing.assert_array_equal(read_sequence(report.dataset, "clip").frames.cut, [True, False, True, False])
+    assert report.skipped == {"clip": {10: "the frames 10..11 are missing"}}
+    every_tenth = write_dump(tmp_path / "sparse", numbers=[0, 10, 20])
+    with pytest.raises(ValueError, match=r"sparse: expected frames that follow each other, got 0, 10, 20: every one"):
+        import_dataset(every_tenth, tmp_path / "out", "blender", skip_broken=True)
 
 
 def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
@@ -259,11 +272,19 @@ def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
     with pytest.raises(ValueError, match=r"lr\.0010\.exr, channel .*: expected 20x12 as meta\.json says, got 20x11"):
         run()
     with pytest.raises(ValueError, match=r"test: expected first <= last within the frames 8\.\.13, got 12\.\.14"):
-        import_dataset(dump, tmp_path / "out", "blender", splits={"train": (8, 11), "test": (12, 14)})
+        import_dataset(
+            dump, tmp_path / "out", "blender", splits={"train": (8, 10), "validation": (11, 11), "test": (12, 14)}
+        )
     meta = json.loads((dump / "meta.json").read_text())
     (dump / "meta.json").write_text(json.dumps({**meta, "display_size": [50, 24]}))
     with pytest.raises(ValueError, match=r"whole multiple of render_size, got 50x24 and 20x12"):
         run()
+    for size in ([0, 0], [20.5, 12], [-20, 12]):
+        (dump / "meta.json").write_text(json.dumps({**meta, "render_size": size}))
+        with pytest.raises(
+            ValueError, match=r"meta\.json: expected render_size and display_size in whole pixels, above"
+        ):
+            run()
     del meta["frames"]["9"]["lens_mm"]
     (dump / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(ValueError, match=r"meta\.json: the field 'lens_mm' is missing"):

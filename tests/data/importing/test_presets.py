@@ -213,9 +213,7 @@ def test_arm_nss(tmp_path, reverse, far):
     known, other = truth(), truth(seed=5)
     write_arm(tmp_path / "dump", known, reverse=reverse, far=far, cut_at=2)
     write_arm(tmp_path / "dump", other, "0008", reverse=reverse, far=far)
-    report = import_dataset(
-        tmp_path / "dump", tmp_path / "out", "arm-nss", splits={"train": ["0007"], "test": ["0008"]}
-    )
+    report = import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
     assert report.sequence.channels == ("color", "depth", "motion")
     for name, expected in (("0007", known), ("0008", other)):
         got = imported(report, name)
@@ -227,7 +225,7 @@ def test_arm_nss(tmp_path, reverse, far):
         assert_like(got.reference, expected.reference, "reference")
         np.testing.assert_allclose(got.frames.exposure, [1.5, 2.5, 3.5, 4.5])
     np.testing.assert_array_equal(imported(report, "0007").frames.cut, [True, False, True, False])
-    assert report.dataset.splits == {"train": (("0007", 0, 3, 0),), "test": (("0008", 0, 3, 0),)}
+    assert report.dataset.splits == {"test": (("0007", 0, 3, 0), ("0008", 0, 3, 0))}
 
 
 def test_arm_errors(tmp_path):

@@ -129,7 +129,8 @@ def test_an_interrupted_import_goes_on_and_gives_the_same_dataset(tmp_path):
     assert (tmp_path / "a" / "Temple" / "lr.0002.exr").stat().st_mtime_ns == before
     assert resumed.totals == fresh.totals and resumed.dataset.splits == fresh.dataset.splits
     jax.tree.map(np.testing.assert_array_equal, imported(resumed, "Temple"), imported(fresh, "Temple"))
-    assert resumed.skipped == {"Temple": {3: ""}} and "SceneDepth.0003.exr" in fresh.skipped["Temple"][3]
+    assert resumed.skipped == fresh.skipped and "SceneDepth.0003.exr" in fresh.skipped["Temple"][3]
+    assert run("a").skipped == fresh.skipped
     assert fresh.dataset.source["skipped"] == {"Temple": [3]}
     np.testing.assert_array_equal(np.flatnonzero(imported(fresh, "Temple").frames.cut), [0, 2])
     assert fresh.dataset.splits["train"] == (("Temple", 1, 7, 1),)
@@ -194,9 +195,28 @@ def test_which_files_are_frames(tmp_path):
 
 def test_splits_fit_what_was_written():
     clips = {"a": range(1, 11), "b": range(1, 11)}
-    segments = split_segments(clips, {"train": (1, 6), "test": (7, 10)})
-    fitted = fit_segments(segments, {"a": (2, 3, 6, 7, 9), "b": (1, 2)})
-    assert fitted == {"train": [("a", 2, 6, 2), ("b", 1, 2, 1)], "test": [("a", 2, 9, 7)]}
-    with pytest.raises(ValueError, match="test: there is no sequence 'c'; there are a, b"):
-        split_segments(clips, {"test": ["a", "c"]})
+    segments = split_segments(clips, {"train": (1, 6), "validation": (7, 7), "test": (8, 10)})
+    assert segments["validation"] == [("a", 1, 7, 7), ("b", 1, 7, 7)]
+    fitted = fit_segments(segments, {"a": (2, 3, 6, 9), "b": (1, 2)})
+    assert fitted == {"train": [("a", 2, 6, 2), ("b", 1, 2, 1)], "test": [("a", 2, 9, 9)]}
+    with pytest.raises(
+        ValueError, match=r"test: there is no sequence 'c'; there are a, b\. Frames are given as FIRST:"
+    ):
+        split_segments(clips, {"train": ["a"], "validation": ["b"], "test": ["c"]})
     assert split_segments({"a": range(3)}, None) == {"test": [("a", 0, 2, 0)]}
+
+
+def test_splits_share_no_frame_and_are_all_given():
+    clips = {name: range(12) for name in "abc"}
+    names = {"train": ["a"], "validation": ["b"], "test": ["c"]}
+    assert split_segments(clips, names) == {split: [(name[0], 0, 11, 0)] for split, name in names.items()}
+    with pytest.raises(
+        ValueError, match=r"splits: validation, test missing\. Give train, validation and test, or none"
+    ):
+        split_segments(clips, {"train": (0, 5)})
+    with pytest.raises(
+        ValueError, match=r"splits: train and validation share the frames 5\.\.8 of a\. A frame that is"
+    ):
+        split_segments(clips, {"train": (0, 9), "validation": (5, 8), "test": (10, 11)})
+    with pytest.raises(ValueError, match=r"splits: train and test share the frames 0\.\.11 of b"):
+        split_segments(clips, {**names, "train": ["a", "b"], "validation": ["c"], "test": ["b"]})
