@@ -10,6 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,8 @@ SMALL_IMAGE = 512 << 20
 """A file may always declare this many bytes of pixels ..."""
 MAX_COMPRESSION = 2000
 """... and this many more for each byte it has; beyond, its header is damaged. A constant image reaches 1259 (PXR24)."""
+SHOWN = 12
+"""Channel names in a message."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _LFS = b"version https://git-lfs"
 
@@ -65,9 +68,18 @@ def _open(path: Path, *, header_only: bool) -> list[OpenEXR.Part]:
         raise ValueError(f"{path}: the file is damaged ({error}). Download or render it again.") from error
 
 
-def _list(names: Iterable[str], limit: int = 12) -> str:
+def _list(names: Iterable[str], limit: int = SHOWN) -> str:
     names = sorted(names)
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+
+
+def _closest(names: Iterable[str], wanted: Iterable[str]) -> str:
+    """All names, or of many those most like a wanted one."""
+    names, wanted = sorted(names), [name.lower() for name in wanted]
+    if len(names) <= SHOWN:
+        return _list(names)
+    like = lambda name: max(SequenceMatcher(None, name.lower(), other).ratio() for other in wanted)
+    return f"{len(names)}, the closest are " + ", ".join(sorted(names, key=like, reverse=True)[:SHOWN])
 
 
 class _Part(NamedTuple):
@@ -175,7 +187,7 @@ def read_all(path: str | os.PathLike, expect: Iterable[str] = ()) -> tuple[dict[
     declared = {full for part in names for full in part.values()}
     missing = set(expect) - declared
     if missing:
-        raise ValueError(f"{path}: expected the channels {_list(missing)}; the file has {_list(declared)}.")
+        raise ValueError(f"{path}: expected the channels {_list(missing)}; the file has {_closest(declared, missing)}.")
     channels: dict[str, np.ndarray] = {}
     for part in _open(path, header_only=False):  # without the damaged ones
         channels |= _planes(names[part.part_index], described[part.part_index], part)

@@ -129,3 +129,14 @@ def test_one_damaged_part_of_many_is_noticed(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"truncated or damaged: the channels V\.b\.X cannot be read"):
         exr.read(path)
+
+
+def test_of_many_channels_the_closest_names_are_shown(tmp_path):
+    """A file of an engine: which of its 40 was meant?"""
+    plane = np.zeros((2, 2), np.float32)
+    names = [f"FinalImagePass{i:02d}.{suffix}" for i in range(10) for suffix in "RGBA"]
+    exr.write(tmp_path / "a.exr", dict.fromkeys([*names, "velocity.X", "velocity.Y"], plane))
+    with pytest.raises(
+        ValueError, match=r"channels Velocity\.V; the file has 42, the closest are velocity\.X, velocity\.Y, F"
+    ):
+        exr.read(tmp_path / "a.exr", ["Velocity.V"])

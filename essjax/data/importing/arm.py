@@ -3,6 +3,7 @@
 Layout and fields: "NSS Dataset Specification" of Arm's Neural Graphics Model Gym, version 1.0.1.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,46 @@ import numpy as np
 from essjax.data.importing.facts import Facts, FrameFacts, lookup
 from essjax.data.layout import read_json
 
-RATIO = "x2_index"
+RATIO = re.compile(r"x(\d+(?:_\d+)?)_index")
+"""``x2_index``, ``x1_5_index``: the upscaling ratio in the name of an index."""
+CLOSE = 0.02
+"""Relative difference of two ratios that counts as equal: sizes are whole pixels."""
+
+
+def _ratio_index(path: Path, content: Mapping[str, Any], width: int) -> int | None:
+    """Which entry of ``NormalizedPerRatioJitter`` belongs to frames of this width; None: there is only one."""
+    indices = content.get("UpscalingRatiosIndices")
+    if indices is None:
+        return None
+    ratio = content["TargetResolution"]["X"] / width
+    for name, index in indices.items():
+        match = RATIO.fullmatch(name)
+        if match and abs(float(match[1].replace("_", ".")) / ratio - 1) < CLOSE:
+            return int(index)
+    raise ValueError(
+        f"{path}: UpscalingRatiosIndices has {', '.join(indices) or 'nothing'}, but the target is {ratio:.3g} times as "
+        f"wide as the frames of {width} pixels. Are these the frames of another ratio ([files] in the recipe)?"
+    )
+
+
+def _jitter(record: Mapping[str, Any], index: int | None) -> np.ndarray:
+    jitters = record["NormalizedPerRatioJitter"]
+    if index is None and len(jitters) != 1:
+        raise ValueError(f"{len(jitters)} entries of NormalizedPerRatioJitter, and no UpscalingRatiosIndices")
+    jitter = jitters[index or 0]
+    return np.asarray([jitter["X"], jitter["Y"]], np.float32)
 
 
 def arm_facts(path: Path, width: int, height: int) -> Facts:
-    """Jitter (fractions of the frame's size), exposure, cuts and planes of one capture.
+    """Jitter (fractions of the frame's size), exposure, cuts and planes of one capture, and whether motion is dilated.
+
+    Args:
+      path: of the JSON.
+      width: of the frames, pixels: with the target's it says which ratio's jitter is theirs.
+      height: of the frames, pixels.
 
     Raises:
-      ValueError: the file is missing or damaged, or the reference is not linear.
+      ValueError: the file is missing or damaged, the reference is not linear, or there is no jitter for this width.
     """
     content = read_json(path)
     if content.get("GTColorSpace", "Linear") != "Linear":
@@ -27,22 +60,25 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
     try:
         # The plugin for Unreal writes FrameNumber where the specification says Frame.
         frames = {int(record.get("Frame", record.get("FrameNumber"))): record for record in content["Frames"]}
-        ratio = int(content["UpscalingRatiosIndices"][RATIO])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: expected Frames and UpscalingRatiosIndices {RATIO} ({error!r}).") from error
+        raise ValueError(f"{path}: expected Frames ({error!r}).") from error
+    try:
+        index = _ratio_index(path, content, width)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected TargetResolution and UpscalingRatiosIndices ({error!r}).") from error
 
     def facts(number: int, header: Mapping[str, Any]) -> FrameFacts:
         record = lookup(path, frames, number)
         try:
-            jitter = record["NormalizedPerRatioJitter"][ratio]
             far = float(record["CameraFarPlane"])
             return FrameFacts(
-                jitter=np.asarray([jitter["X"], jitter["Y"]], np.float32),
+                jitter=_jitter(record, index),
                 exposure=float(record.get("Exposure", 1.0)),
                 cut=bool(record.get("CameraCut", False)),
                 near=float(record["CameraNearPlane"]),
                 far=np.inf if far == -1 else far,
                 depth_kind="reversed" if content.get("ReverseZ", False) else "forward",
+                dilated=bool(content.get("MotionVectorsDilated", False)),
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ValueError(

@@ -10,19 +10,40 @@ VELOCITY_ZERO = 32767 / 65535
 """What Unreal's 16-bit velocity texture holds where nothing moves."""
 VELOCITY_RANGE = 0.499 * 0.5
 """Encoded velocity per unit of normalised device coordinates."""
+RAW_VELOCITY = ("unreal4", "unreal5")
+"""Encodings in which 0 says that the engine wrote no velocity: there only the camera moves."""
 SHORT_NORMAL = 1e-3
 """Shorter than this is no normal."""
 
 
-def decode_velocity(encoded: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unreal's velocity texture to normalised device coordinates.
+def decode_velocity(encoded: np.ndarray, encoding: str) -> tuple[np.ndarray, np.ndarray]:
+    """Unreal's velocity to normalised device coordinates (2 = the image's width).
+
+    Args:
+      encoded: ``[H, W, 2]``, in [0, 1].
+      encoding: "unreal4": v · 0.2495 + 32767 / 65535; "unreal5": the same of sign(v) · sqrt(2 |v|), for small motion;
+        "unreal-mrq": 0.5 + v / 2, which is what Epic's documentation says of Movie Render Queue's MotionVectors pass.
 
     Returns:
-      ``[H, W, 2]`` current - previous, y up, and bool ``[H, W, 1]``: true where the engine wrote a velocity (it writes
-      0 where only the camera moves).
+      ``[H, W, 2]`` current - previous, y up, and bool ``[H, W, 1]``: true where the engine wrote a velocity (the first
+      two hold 0 where only the camera moves).
+
+    Raises:
+      ValueError: much of an "unreal-mrq" image is exactly 0, which would be half a screen.
     """
+    if encoding == "unreal-mrq":
+        unwritten = float((encoded == 0).all(axis=-1).mean())
+        if unwritten > 0.01:
+            raise ValueError(
+                f"motion: the MotionVectors pass holds 0.5 where nothing moves, this image 0 in {unwritten:.1%} of the "
+                "pixels: is it the raw velocity texture? Then give [motion] encoding unreal4 or unreal5 in the recipe."
+            )
+        return 2 * encoded - 1, np.ones_like(encoded[..., :1], bool)
     written = encoded[..., :1] != 0
-    return ((encoded - np.float32(VELOCITY_ZERO)) / np.float32(VELOCITY_RANGE)) * written, written
+    velocity = (encoded - np.float32(VELOCITY_ZERO)) / np.float32(VELOCITY_RANGE)
+    if encoding == "unreal5":
+        velocity = 0.5 * velocity * np.abs(velocity)
+    return velocity * written, written
 
 
 def to_pixels(
@@ -112,6 +133,8 @@ def unit_normals(stored: np.ndarray, encoding: str) -> np.ndarray:
 
 def radical_inverse(index: int, base: int) -> float:
     """The digits of ``index`` mirrored at the point: element ``index`` of the Halton sequence of ``base``."""
+    if index < 0:
+        raise ValueError(f"Halton: expected an element >= 0, got {index}.")
     value, weight = 0.0, 1.0 / base
     while index:
         index, digit = divmod(index, base)

@@ -1,7 +1,7 @@
 """Clips of a dump that a recipe describes: finds the files, reads them, applies the conversions frame by frame."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,9 +86,11 @@ class RecipeClip:
         counts |= {"pixels": hit.size, "background": int(hit.size - np.count_nonzero(hit))}
         cut = facts.cut or number - 1 not in self.digits
         motion, unwritten = self._motion(images.pop("motion"), number, facts, jitter, depth, cut)
-        if self.recipe.motion.encoding == "unreal":
+        if self.recipe.motion.encoding in convert.RAW_VELOCITY:
             counts["unwritten"] = unwritten
-        buffers = {name: buffer(name, image, hit, self.recipe) for name, image in images.items()}
+        converted = {name: buffer(name, image, hit, self.recipe) for name, image in images.items()}
+        buffers = {name: image for name, (image, _) in converted.items()}
+        counts["outside"] = sum(outside for _, outside in converted.values())
         frame = Frame(
             color=color,
             gbuffers=gbuffers_of({**buffers, "depth": depth}),
@@ -127,8 +129,8 @@ class RecipeClip:
         """Motion in essjax's convention, and how many pixels had none of their own."""
         rule, (height, width) = self.recipe.motion, stored.shape[:2]
         written = np.ones((1, 1, 1), bool)
-        if rule.encoding == "unreal":
-            stored, written = convert.decode_velocity(stored)
+        if rule.encoding != "plain":
+            stored, written = convert.decode_velocity(stored, rule.encoding)
         pixels = convert.to_pixels(stored * np.float32(rule.scale), rule.unit, width, height, x=rule.x, y=rule.y)
         if rule.resolution is not None:
             pixels *= np.asarray([width / rule.resolution[0], height / rule.resolution[1]], np.float32)
@@ -155,7 +157,7 @@ def open_dump(
 
     Args:
       source: the dump's folder.
-      recipe: of the dump; ``make_facts`` may change it per sequence.
+      recipe: of the dump; where the metadata of a sequence says that motion is dilated, its clip's says so too.
       reference: folder of the references; None: the recipe's, or else the colour.
       make_facts: of one sequence.
       preset: name, to be recorded.
@@ -170,20 +172,33 @@ def open_dump(
     clips = []
     for sequence, digits in found.items():
         width, height = first[sequence][1]
+        facts = make_facts(sequence, recipe, width, height)
+        dilated = recipe.motion.dilated or _dilated(facts, digits)
+        of_clip = dataclasses.replace(recipe, motion=dataclasses.replace(recipe.motion, dilated=dilated))
         clips.append(
             RecipeClip(
                 name=sequence or source.resolve().name,
                 digits=digits,
-                source={"preset": preset, "reference": "own" if reference_root else "color", **recipe.record()},
-                recipe=recipe,
+                source={"preset": preset, "reference": "own" if reference_root else "color", **of_clip.record()},
+                recipe=of_clip,
                 root=source,
                 reference_root=reference_root,
                 sequence=sequence,
                 images=tuple(present),
-                facts=make_facts(sequence, recipe, width, height),
+                facts=facts,
             )
         )
     return clips
+
+
+def _dilated(facts: Facts, numbers: Iterable[int]) -> bool:
+    """Whether the metadata says so, at the first frame that it knows."""
+    for number in numbers:
+        try:
+            return facts(number, {}).dilated
+        except ValueError:  # raised again, with the frame's number, when that is converted
+            continue
+    return False
 
 
 def _first_readable(

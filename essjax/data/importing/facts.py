@@ -29,6 +29,7 @@ class FrameFacts:
       depth_kind: "reversed" or "forward", or None.
       camera: in pixels of the frames, or None.
       previous: camera of the frame before, or None.
+      dilated: motion was dilated before it was stored.
     """
 
     jitter: np.ndarray | None = None
@@ -39,6 +40,7 @@ class FrameFacts:
     depth_kind: str | None = None
     camera: Camera | None = None
     previous: Camera | None = None
+    dilated: bool = False
 
 
 Facts = Callable[[int, Mapping[str, Any]], FrameFacts]
@@ -97,8 +99,8 @@ def generic_facts(path: Path, width: int, height: int) -> Facts:
                 jitter=None if "jitter" not in record else np.asarray(record["jitter"], np.float32).reshape(2),
                 exposure=float(record.get("exposure", 1.0)),
                 cut=bool(record.get("cut", False)),
-                near=record.get("near"),
-                far=record.get("far"),
+                near=None if record.get("near") is None else float(record["near"]),
+                far=None if record.get("far") is None else float(record["far"]),
                 camera=camera(number),
                 previous=camera(number - 1),
             )

@@ -1,5 +1,6 @@
 """Which sequences and frames a dump holds: paths that match a pattern with ``{sequence}`` and ``{frame}``."""
 
+import glob
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,7 +35,7 @@ def find_frames(root: Path, pattern: str) -> Mapping[str, Mapping[int, str]]:
       ValueError: nothing matches, or two files are the same frame.
     """
     regex, found = _regex(pattern), {}
-    for path in root.glob(fill(pattern, "*", "*")):
+    for path in root.glob(fill(glob.escape(pattern), "*", "*")):
         match = regex.fullmatch(path.relative_to(root).as_posix())
         if match is None:
             continue

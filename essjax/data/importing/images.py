@@ -12,12 +12,22 @@ from essjax.data.importing.facts import FrameFacts
 from essjax.data.importing.recipe import Recipe
 
 UNIT_RANGE = ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive")
+LARGEST_ID = 2**31 - 1
+"""Ids are int32."""
+TOLERANCE, BEYOND = 1e-3, 0.05
+"""By which values may leave [0, 1] without being counted (half precision), and without being odd (denoisers)."""
+FEW = 0.05
+"""Share of the pixels that may be odd."""
+OFF_LENGTH, ENOUGH = 0.1, 100
+"""By how much half of the normals may miss unit length, if there are so many: silhouettes mix shorter ones."""
 
 
 def read_images(
     wanted: Mapping[str, tuple[Path, tuple[str, ...]]],
 ) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
     """``[H, W, C]`` float32 images of one size, each file read once, and the header of the first file.
+
+    The stencil is float64, which holds every id of 32 bits.
 
     Args:
       wanted: image -> its file and channel names.
@@ -38,25 +48,31 @@ def read_images(
                 if planes[channel].shape != size:
                     (high, wide), (h, w) = size, planes[channel].shape
                     raise ValueError(f"{path}, channel {channel}: expected {wide}x{high} as the others, got {w}x{h}.")
-            images[name] = _stacked([planes[channel] for channel in wanted[name][1]])
+            dtype = np.float64 if name == "stencil" else np.float32
+            images[name] = _stacked([planes[channel] for channel in wanted[name][1]], dtype)
     return {name: images[name] for name in wanted}, headers[0]
 
 
-def _stacked(planes: list[np.ndarray]) -> np.ndarray:
-    """``[H, W, C]`` float32 over planes that stay contiguous: files hold planes, so nothing is interleaved and back."""
-    image = np.empty((len(planes), *planes[0].shape), np.float32)
+def _stacked(planes: list[np.ndarray], dtype: type[np.floating]) -> np.ndarray:
+    """``[H, W, C]`` over planes that stay contiguous: files hold planes, so nothing is interleaved and back."""
+    image = np.empty((len(planes), *planes[0].shape), dtype)
     for index, plane in enumerate(planes):
         image[index] = plane
     return np.moveaxis(image, 0, -1)
 
 
 def radiance(stored: np.ndarray, recipe: Recipe, facts: FrameFacts) -> tuple[np.ndarray, dict[str, int]]:
-    """Linear scene radiance >= 0, and how many negative and infinite values there were."""
-    color = convert.srgb_to_linear(stored) if recipe.color.encoding == "srgb" else stored
+    """Linear scene radiance >= 0, and how many negative and infinite values there were.
+
+    Finite values beyond half's range stay: ``exr.write`` clamps and counts those.
+    """
+    color = stored * np.float32(recipe.scale.color)
+    color = convert.srgb_to_linear(color) if recipe.color.encoding == "srgb" else color
     if recipe.color.pre_exposed:
         color = color / np.float32(facts.exposure)
-    counts = {"negative": int(np.count_nonzero(stored < 0)), "infinite": int(np.count_nonzero(stored == np.inf))}
-    return np.clip(color, 0.0, exr.HALF_MAX), counts
+    infinite = color == np.inf
+    counts = {"negative": int(np.count_nonzero(stored < 0)), "infinite": int(np.count_nonzero(infinite))}
+    return np.maximum(np.where(infinite, np.float32(exr.HALF_MAX), color), 0.0), counts
 
 
 def view_depth(stored: np.ndarray, recipe: Recipe, facts: FrameFacts, jitter: np.ndarray) -> np.ndarray:
@@ -65,29 +81,87 @@ def view_depth(stored: np.ndarray, recipe: Recipe, facts: FrameFacts, jitter: np
     kind = facts.depth_kind or "" if rule.kind == "metadata" else rule.kind
     if not kind:
         raise ValueError("depth.kind is metadata, which does not say it. Give [depth] kind.")
-    if kind == "distance":
+    background = np.zeros((), bool)
+    if kind in ("linear", "distance"):
+        background = (np.abs(stored) == exr.HALF_MAX) | (rule.zero_is_background & (stored == 0))
+    if kind == "linear":
+        depth = stored
+    elif kind == "distance":
         if facts.camera is None:
             raise ValueError("depth.kind is distance: that needs the camera of each frame ([files] metadata).")
         depth = convert.depth_from_distance(stored, facts.camera.focal, facts.camera.center, jitter)  # type: ignore[arg-type]
     else:
         near = rule.near if facts.near is None else facts.near
-        if near is None and kind != "linear":
+        if near is None:
             raise ValueError(f"depth.kind is {kind}: that needs the near plane. Give [depth] near.")
         far = rule.far if facts.far is None else facts.far
-        depth = convert.linear_depth(stored, kind, near or 1.0, far)
+        if not 0 < near < far:
+            raise ValueError(f"depth: expected 0 < near < far of the planes, got near {near:g} and far {far:g}.")
+        depth = convert.linear_depth(stored, kind, near, far)
     depth = depth * np.float32(rule.scale)
-    return np.where(depth >= rule.background, np.float32(np.inf), depth)
+    return np.where(background | (depth >= rule.background), np.float32(np.inf), depth)
 
 
-def buffer(name: str, stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> np.ndarray:
-    """An optional G-buffer: its range, its encoding, 0 on the background."""
+def buffer(name: str, stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> tuple[np.ndarray, int]:
+    """An optional G-buffer: its range, its encoding, 0 on the background.
+
+    Args:
+      name: of the image.
+      stored: ``[H, W, C]``.
+      hit: bool ``[H, W, 1]``, not background.
+      recipe: of the dump.
+
+    Returns:
+      The image, and how many values were outside [0, 1] and clipped.
+
+    Raises:
+      ValueError: more than a few are outside, or the normals are not of unit length (names the recipe's key), or an id
+        is too large.
+    """
     if name in UNIT_RANGE:
-        linear = name == "base_color" and recipe.base_color.encoding == "srgb"
-        image = np.clip(convert.srgb_to_linear(stored) if linear else stored, 0.0, 1.0)
-        return image if name == "reactive" else np.where(hit, image, np.float32(0.0))
+        return _unit_range(name, stored, np.ones_like(hit) if name == "reactive" else hit, recipe)
     if name == "stencil":
-        return np.where(hit, np.rint(stored), 0.0).astype(np.int32)
+        ids = np.where(hit, np.rint(stored), 0.0)
+        if not (np.abs(ids) <= LARGEST_ID).all():  # also NaN
+            worst = ids.ravel()[np.argmax(np.where(np.isnan(ids), np.inf, np.abs(ids)))]
+            raise ValueError(f"stencil: expected ids up to {LARGEST_ID}, got {worst:.10g}. Renumber the objects.")
+        return ids.astype(np.int32), 0
+    if name == "normal":
+        _check_normals(stored, hit, recipe)
     image = convert.unit_normals(stored, recipe.normal.encoding) if name == "normal" else stored * recipe.world.scale
     if recipe.world.handedness == "left":
         image = image * np.asarray([1.0, -1.0, 1.0], np.float32)
-    return np.where(hit, image, np.float32(0.0)).astype(np.float32)
+    return np.where(hit, image, np.float32(0.0)).astype(np.float32), 0
+
+
+def _unit_range(name: str, stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> tuple[np.ndarray, int]:
+    image = stored * np.float32(getattr(recipe.scale, name))
+    excess = np.where(hit, np.maximum(-image, image - 1.0), 0.0)
+    outside = int(np.count_nonzero(excess > TOLERANCE))
+    share = np.count_nonzero((excess > BEYOND).any(axis=-1)) / max(np.count_nonzero(hit), 1) if outside else 0.0
+    if share > FEW:
+        values = image[np.broadcast_to(hit, image.shape)]
+        raise ValueError(
+            f"{name} ({', '.join(recipe.channels[name])}): expected values in [0, 1], found {np.nanmin(values):.4g} to "
+            f"{np.nanmax(values):.4g}, outside in {share:.1%} of the pixels. [scale] {name} in the recipe is what they "
+            f"are multiplied with (0.0039216 if 255 means 1); or is it another channel ([channels] {name})?"
+        )
+    curved = name == "base_color" and recipe.base_color.encoding == "srgb"
+    image = np.clip(convert.srgb_to_linear(image) if curved else image, 0.0, 1.0)
+    return np.where(hit, image, np.float32(0.0)), outside
+
+
+def _check_normals(stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> None:
+    encoding = recipe.normal.encoding
+    vectors = (stored if encoding == "signed" else 2.0 * stored - 1.0)[hit[..., 0]]
+    length = np.sqrt(np.square(vectors).sum(-1))
+    there = length > convert.SHORT_NORMAL
+    if np.count_nonzero(there) < ENOUGH or np.median(np.abs(length[there] - 1.0)) <= OFF_LENGTH:
+        return
+    other = "unsigned" if encoding == "signed" else "signed"
+    says = "none has a negative component" if vectors[there].min() > -OFF_LENGTH else "some components are negative"
+    raise ValueError(
+        f"normal ({', '.join(recipe.channels['normal'])}): read as {encoding}, their lengths are "
+        f"{length[there].min():.2f} to {length[there].max():.2f} instead of 1, and {says}. Is [normal] encoding "
+        f"{other}, or is it another channel ([channels] normal)?"
+    )

@@ -5,10 +5,11 @@ TOML is one dataclass below; docs/guides/importing.md shows a complete one.
 """
 
 import dataclasses
+import math
 import os
 import tomllib
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from essjax.data.layout import SUFFIXES
@@ -35,7 +36,8 @@ class MotionRule:
       x: where a positive x points.
       scale: what the stored values are multiplied with first.
       resolution: (width, height) of the image whose pixels the unit "pixels" means; None: its own.
-      encoding: "unreal": the 16-bit velocity texture; pixels it left out move with the cameras.
+      encoding: "plain": none. "unreal4", "unreal5": the velocity texture of that engine, the second with a square root;
+        pixels it left out move with the cameras. "unreal-mrq": Movie Render Queue's MotionVectors pass.
       jittered: the difference of the two frames' jitter is in it, and is taken out.
       dilated: each pixel holds its nearest neighbour's motion. It cannot be undone; it is recorded.
     """
@@ -46,7 +48,7 @@ class MotionRule:
     x: str = _choice("right", "left", default="right")
     scale: float = 1.0
     resolution: tuple[int, int] | None = None
-    encoding: str = _choice("plain", "unreal", default="plain")
+    encoding: str = _choice("plain", "unreal4", "unreal5", "unreal-mrq", default="plain")
     jittered: bool = False
     dilated: bool = False
 
@@ -60,8 +62,10 @@ class DepthRule:
         near plane 0, far plane 1; "metadata": one of the last two, as the metadata says.
       near: near plane of the last two, in the dump's unit; the metadata's, if it has one, goes first.
       far: far plane; infinite by default.
-      scale: metres per unit of the dump.
-      background: metres from which on it is background (sky); it becomes +inf.
+      scale: metres per unit of the dump; negative where z is negative in front of the camera.
+      background: metres from which on it is background (sky); it becomes +inf. So does 65504, where half ends, of the
+        first two kinds.
+      zero_is_background: of the first two kinds, 0 is background too.
     """
 
     kind: str = _choice("linear", "distance", "reversed", "forward", "metadata")
@@ -69,6 +73,7 @@ class DepthRule:
     far: float = float("inf")
     scale: float = 1.0
     background: float = float("inf")
+    zero_is_background: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,6 +126,19 @@ class BaseColorRule:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class ScaleRule:
+    """``[scale]``: what stored values are multiplied with first, by image; ``color`` is also that of the reference."""
+
+    color: float = 1.0
+    base_color: float = 1.0
+    roughness: float = 1.0
+    metallic: float = 1.0
+    specular: float = 1.0
+    n_dot_v: float = 1.0
+    reactive: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class WorldRule:
     """``[world]``, for normals and positions.
 
@@ -153,6 +171,7 @@ class Recipe:
     color: ColorRule = ColorRule()
     normal: NormalRule = NormalRule()
     base_color: BaseColorRule = BaseColorRule()
+    scale: ScaleRule = ScaleRule()
     world: WorldRule = WorldRule()
 
     def pattern(self, image: str) -> str:
@@ -171,9 +190,10 @@ class Recipe:
         return plain(dataclasses.asdict(self))
 
 
+POSITIVE = ("near", "far", "background", *(field.name for field in dataclasses.fields(ScaleRule)))
 _TABLES = {
     "motion": MotionRule, "depth": DepthRule, "jitter": JitterRule, "color": ColorRule, "normal": NormalRule,
-    "base_color": BaseColorRule, "world": WorldRule,
+    "base_color": BaseColorRule, "scale": ScaleRule, "world": WorldRule,
 }  # fmt: skip
 
 
@@ -184,15 +204,34 @@ def _value(where: str, field: dataclasses.Field, value: Any) -> Any:
     if choices:
         return value
     if field.name == "resolution":
-        if not (isinstance(value, list) and len(value) == 2 and all(isinstance(v, int) and v > 0 for v in value)):
+        if not (isinstance(value, list) and len(value) == 2 and all(type(v) is int and v > 0 for v in value)):
             raise ValueError(f"{where}: expected [width, height] in pixels, got {value!r}.")
         return tuple(value)
     expected = bool if field.type is bool else int if field.type is int else float
     if isinstance(value, bool) != (expected is bool) or not isinstance(value, (int, float)):
         raise ValueError(f"{where}: expected a {'true or false' if expected is bool else 'number'}, got {value!r}.")
-    if expected is int and value != int(value):
+    if expected is bool:
+        return value
+    number = _number(where, value, infinite=field.name in ("far", "background"))
+    if expected is int and number != int(number):
         raise ValueError(f"{where}: expected a whole number, got {value!r}.")
+    if field.name == "scale" and number == 0:
+        raise ValueError(f"{where}: expected another number than 0.")
+    lowest = 1 if field.name == "length" else 0
+    if (field.name in ("first", "length") and number < lowest) or (field.name in POSITIVE and number <= 0):
+        above = f"at least {lowest}" if expected is int else "above 0"
+        raise ValueError(f"{where}: expected a number {above}, got {value!r}.")
     return expected(value)
+
+
+def _number(where: str, value: int | float, *, infinite: bool) -> float:
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if math.isnan(number) or (math.isinf(number) and not infinite):
+        raise ValueError(f"{where}: expected a {'' if infinite else 'finite '}number, got {value!r}.")
+    return number
 
 
 def _rule(where: str, rule: type, content: Any) -> Any:
@@ -223,6 +262,8 @@ def _files(where: str, content: Any) -> dict[str, str]:
     for key, pattern in files.items():
         if not isinstance(pattern, str) or (key != "metadata" and "{frame}" not in pattern):
             raise ValueError(f"{where} {key}: expected a path with {{frame}} in it, got {pattern!r}.")
+        if PurePath(pattern).is_absolute() or not pattern:
+            raise ValueError(f"{where} {key}: expected a path below the dump's folder, got {pattern!r}.")
     if "frame" not in files and "color" not in files:
         raise ValueError(f"{where}: expected a pattern for frame (all images in one file) or for color.")
     return files
@@ -254,7 +295,8 @@ def make_recipe(content: Mapping[str, Any], where: str) -> Recipe:
         raise ValueError(f"{where}: there is no table {unknown[0]!r}; there are {', '.join(sorted(known))}.")
     channels = _channels(f"{where}: [channels]", content.get("channels"))
     optional = content.get("optional", [])
-    if not isinstance(optional, list) or any(image not in channels or image in REQUIRED for image in optional):
+    names = [image for image in channels if image not in REQUIRED]
+    if not isinstance(optional, list) or any(image not in names for image in optional):
         raise ValueError(f"{where}: optional: expected a list of images of [channels] but {', '.join(REQUIRED)}.")
     rules = {
         name: _rule(f"{where}: [{name}]", rule, content.get(name, {}))
@@ -274,6 +316,16 @@ def _check(recipe: Recipe, where: str) -> None:
     wants_metadata = recipe.jitter.source == "metadata" or recipe.color.pre_exposed
     if wants_metadata and "metadata" not in recipe.files:
         raise ValueError(f"{where}: [files] metadata: missing. jitter.source or color.pre_exposed ask for it.")
+    motion, depth = recipe.motion, recipe.depth
+    if motion.resolution is not None and motion.unit != "pixels":
+        raise ValueError(f"{where}: [motion] resolution: only for the unit pixels, got {motion.unit}. Leave it out.")
+    if depth.near is not None and depth.near >= depth.far:
+        raise ValueError(f"{where}: [depth] near: expected less than far, {depth.far:g}, got {depth.near:g}.")
+    if depth.zero_is_background and depth.kind not in ("linear", "distance"):
+        raise ValueError(
+            f"{where}: [depth] zero_is_background: only for the kinds linear and distance, got {depth.kind}, in which "
+            "0 is the far plane (reversed) or the near one (forward). Leave it out."
+        )
 
 
 def _merge(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

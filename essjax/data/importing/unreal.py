@@ -4,6 +4,7 @@ Unreal's world is left-handed, z up, in centimetres; its camera looks along +X w
 is that one with y negated (right-handed), in metres.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -40,7 +41,15 @@ def _number(header: Mapping[str, Any], names: list[str]) -> float | None:
     for name in names:
         if name in header:
             value = header[name]
-            return float(value.decode() if isinstance(value, bytes) else value)
+            try:
+                number = float(value.decode() if isinstance(value, bytes) else value)
+            except (ValueError, TypeError):  # UnicodeDecodeError is a ValueError
+                number = math.nan
+            if not math.isfinite(number):
+                raise ValueError(
+                    f"header, {name}: expected a number, got {value!r}. Was the file changed? Render it again."
+                )
+            return number
     return None
 
 
@@ -53,11 +62,17 @@ def _camera(header: Mapping[str, Any], which: str, width: int, height: int) -> C
     numbers = [value for value in values if value is not None]
     if fov is None or len(numbers) < len(values):
         return None
+    if not 0 < fov < 180:
+        raise ValueError(f"header: expected a field of view in (0, 180) degrees, got {fov:g}.")
     focal = focal_length(np.radians(fov), width)
     matrix = camera_to_world((numbers[0], numbers[1], numbers[2]), *numbers[3:])
     return make_camera(matrix, [focal, focal], [width / 2, height / 2])
 
 
 def header_facts(header: Mapping[str, Any], width: int, height: int) -> FrameFacts:
-    """The cameras of a frame and of the one before; none if the header does not hold them."""
+    """The cameras of a frame and of the one before; none if the header does not hold them.
+
+    Raises:
+      ValueError: names what in the header is no number.
+    """
     return FrameFacts(camera=_camera(header, "cur", width, height), previous=_camera(header, "prev", width, height))

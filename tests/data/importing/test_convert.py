@@ -12,13 +12,25 @@ def pixel(*values):
 
 
 def test_velocity_texture():
-    """Oracle: Unreal's encoder written out, ndc * 0.499 * 0.5 + 32767 / 65535; 0 means that nothing was written."""
+    """Oracle: Unreal's encoders written out, ndc * 0.499 * 0.5 + 32767 / 65535 and, in version 5, the same of
+    sign(ndc) * sqrt(|ndc|) * 2 / sqrt(2); 0 means that nothing was written."""
     ndc = pixel(0.3, -1.2)
-    decoded, written = convert.decode_velocity(ndc * 0.2495 + 32767 / 65535)
-    np.testing.assert_allclose(decoded, ndc, atol=1e-6)
+    root = np.sign(ndc) * np.sqrt(np.abs(ndc)) * 2 / np.sqrt(2)
+    for encoding, stored in (("unreal4", ndc), ("unreal5", root)):
+        decoded, written = convert.decode_velocity(stored * 0.2495 + 32767 / 65535, encoding)
+        np.testing.assert_allclose(decoded, ndc, atol=1e-6)
+        assert written.all()
+        decoded, written = convert.decode_velocity(pixel(0.0, 0.0), encoding)
+        assert not written.any() and not decoded.any()
+
+
+def test_motion_vectors_pass():
+    """0.5 is no motion; 0.75 a quarter of the image's width, half a unit; a texture that holds 0 is another one."""
+    decoded, written = convert.decode_velocity(pixel(0.75, 0.5), "unreal-mrq")
+    np.testing.assert_array_equal(decoded[0, 0], [0.5, 0])
     assert written.all()
-    decoded, written = convert.decode_velocity(pixel(0.0, 0.0))
-    assert not written.any() and not decoded.any()
+    with pytest.raises(ValueError, match=r"this image 0 in 100\.0% of the pixels.*encoding unreal4 or unreal5"):
+        convert.decode_velocity(pixel(0.0, 0.0), "unreal-mrq")
 
 
 @pytest.mark.parametrize(
@@ -103,3 +115,5 @@ def test_halton():
     """Oracle: 1/2, 1/4, 3/4 and 1/3, 2/3, 1/9, less one half."""
     got = [convert.halton(index) for index in (1, 2, 3)]
     np.testing.assert_allclose(got, [[0, -1 / 6], [-0.25, 1 / 6], [0.25, 1 / 9 - 0.5]], atol=1e-7)
+    with pytest.raises(ValueError, match=r"Halton: expected an element >= 0, got -1"):
+        convert.halton(-1)

@@ -178,6 +178,31 @@ first = 2
         ('channels.color = ["R", "G"]', r"\[channels\] color: expected a list of 3 channel names, got \['R', 'G'\]"),
         ('channels.depht = ["Z"]', r"\[channels\]: there is no key 'depht'; the keys are color, base_color"),
         ('files.frame = "beauty.exr"', r"\[files\] frame: expected a path with \{frame\} in it, got 'beauty\.exr'"),
+        ("jitter.first = -1", r"\[jitter\] first: expected a number at least 0, got -1"),
+        ("jitter.length = 0", r"\[jitter\] length: expected a number at least 1, got 0"),
+        ("jitter.length = inf", r"\[jitter\] length: expected a finite number, got inf"),
+        ("motion.scale = nan", r"\[motion\] scale: expected a finite number, got nan"),
+        ("motion.scale = 0", r"\[motion\] scale: expected another number than 0"),
+        (f"depth.scale = {10**400}", r"\[depth\] scale: expected a finite number, got 1000"),
+        ("depth.near = 0", r"\[depth\] near: expected a number above 0, got 0"),
+        ("depth.near = -0.1", r"\[depth\] near: expected a number above 0, got -0\.1"),
+        ("depth.near = nan", r"\[depth\] near: expected a finite number, got nan"),
+        ("depth.far = nan", r"\[depth\] far: expected a number, got nan"),
+        ("depth = {near = 2.0, far = 1.0}", r"\[depth\] near: expected less than far, 1, got 2"),
+        ("depth.background = 0", r"\[depth\] background: expected a number above 0, got 0"),
+        (
+            'depth = {kind = "reversed", zero_is_background = true}',
+            r"\[depth\] zero_is_background: only for the kinds linear and distance, got reversed",
+        ),
+        ('motion.unit = "uv"', r"\[motion\] resolution: only for the unit pixels, got uv"),
+        ("motion.resolution = [true, true]", r"\[motion\] resolution: expected \[width, height\] in pixels"),
+        ("scale.roughness = 0", r"\[scale\] roughness: expected a number above 0, got 0"),
+        ("scale.depth = 2", r"\[scale\]: there is no key 'depth'; the keys are color, base_color, roughness"),
+        ('files.frame = "/dump/{frame}.exr"', r"\[files\] frame: expected a path below the dump's folder, got '/dump"),
+        ('files.metadata = ""', r"\[files\] metadata: expected a path below the dump's folder, got ''"),
+        ('optional = [["metallic"]]', r"optional: expected a list of images of \[channels\]"),
+        ("optional = [1]", r"optional: expected a list of images of \[channels\]"),
+        ("scale = 2", r"\[scale\]: expected a table, got 2"),
         ('optional = ["depth"]', r"optional: expected a list of images of \[channels\] but color, depth, motion"),
     ],
 )
@@ -253,11 +278,12 @@ def test_presets_and_the_examples_of_the_guide_load(tmp_path):
         recipe.color,
         recipe.normal,
         recipe.base_color,
+        recipe.scale,
         recipe.world,
     ):
         for field in dataclasses.fields(rule):
             assert f"{field.name} = " in complete[0], f"the guide does not show {field.name}"
     change = tmp_path / "change.toml"
-    for preset, block in zip(("unreal", "arm-nss"), [b for b in blocks if b not in complete], strict=True):
+    for preset, block in zip(("unreal", "unreal", "arm-nss"), [b for b in blocks if b not in complete], strict=True):
         change.write_text(block)
         assert load_recipe(preset, change) != load_recipe(preset)

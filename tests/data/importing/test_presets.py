@@ -114,12 +114,16 @@ def unreal_header(t):
     return header
 
 
-def write_unreal(folder, known, moving, *, depth=None, header=True):
-    """Velocity: (current - previous) in NDC, y up, encoded; 0 where nothing but the camera moves."""
+def write_unreal(folder, known, moving=None, *, depth=None, header=True, changes=()):
+    """Velocity: (current - previous), y up: as fractions of the screen + 0.5; with ``moving`` raw, which is 0 where
+    nothing but the camera moves.
+    """
     frames, buffers = known.frames, known.frames.gbuffers
     for t in range(len(frames.cut)):
         ndc = -frames.motion[t] * [1, -1] * 2 / SIZE
-        velocity = np.where(moving[t], ndc * 0.499 * 0.5 + 32767 / 65535, 0.0)
+        velocity = ndc / 2 + 0.5
+        if moving is not None:
+            velocity = np.where(moving[t], ndc * 0.499 * 0.5 + 32767 / 65535, 0.0)
         sky = np.isinf(buffers.depth[t])
         stored = np.where(sky, 65504.0, buffers.depth[t] * CM) if depth is None else depth[t]
         channels = {
@@ -130,16 +134,61 @@ def write_unreal(folder, known, moving, *, depth=None, header=True):
             **rgb(np.where(sky, 0, mirrored(buffers.normal[t])), "FinalImageWorldNormal."),
             **rgb(np.where(sky, 0.3, buffers.base_color[t]), "FinalImageBaseColor."),
         }
-        write(folder / f"shot_010.{t:04d}.exr", channels, unreal_header(t) if header else None)
+        attributes = {**unreal_header(t), **dict(changes)} if header else None
+        write(folder / f"shot_010.{t:04d}.exr", channels, attributes)
 
 
-def test_unreal(tmp_path):
+@pytest.fixture
+def raw(tmp_path):
+    (tmp_path / "raw.toml").write_text('[motion]\nencoding = "unreal4"\n')
+    return tmp_path / "raw.toml"
+
+
+def test_unreal_motion_vectors_pass(tmp_path):
+    known = truth(T=3)
+    write_unreal(tmp_path / "lr", known)
+    report = import_dataset(tmp_path / "lr", tmp_path / "out", "unreal")
+    np.testing.assert_allclose(imported(report, "shot_010").frames.motion[1:], known.frames.motion[1:], atol=3e-4)
+    assert report.sequence.source["motion"]["encoding"] == "unreal-mrq" and "unwritten" not in report.totals
+
+
+def test_unreal_raw_velocity_is_not_taken_for_the_motion_vectors_pass(tmp_path):
+    known = truth(T=2)
+    write_unreal(tmp_path / "lr", known, known.valid > 0.5)
+    with pytest.raises(ValueError, match=r"frame 0: motion: the MotionVectors pass holds 0\.5 where nothing moves"):
+        import_dataset(tmp_path / "lr", tmp_path / "out", "unreal")
+
+
+def test_unreal_far_geometry_is_no_sky(tmp_path):
+    """800 m in a pass of 32 bits; in one of 16 bits the sky ends at 65504 cm."""
+    known = truth(T=1)
+    depth = np.where(np.isinf(known.frames.gbuffers.depth), 65504.0, 80000.0)
+    write_unreal(tmp_path / "lr", known, depth=depth)
+    got = imported(import_dataset(tmp_path / "lr", tmp_path / "out", "unreal"), "shot_010").frames.gbuffers.depth
+    np.testing.assert_array_equal(got, np.where(depth == 65504.0, np.inf, np.float32(800.0)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"unreal/camera/curPos/x": "abc"}, r"frame 0: header, unreal/camera/curPos/x: expected a number, got 'abc'"),
+        ({"unreal/camera/prevRot/yaw": "nan"}, r"header, unreal/camera/prevRot/yaw: expected a number, got 'nan'"),
+        ({"unreal/camera/FinalImage/fov": "0"}, r"header: expected a field of view in \(0, 180\) degrees, got 0"),
+    ],
+)
+def test_unreal_header_that_is_no_number(tmp_path, changes, message):
+    write_unreal(tmp_path / "lr", truth(T=1), changes=changes.items())
+    with pytest.raises(ValueError, match=message):
+        import_dataset(tmp_path / "lr", tmp_path / "out", "unreal")
+
+
+def test_unreal(tmp_path, raw):
     known = truth()
     moving = known.valid > 0.5
     write_unreal(tmp_path / "lr", known, moving)
     for t in range(4):
         write(tmp_path / "hr" / f"shot_010.{t:04d}.exr", rgb(known.reference[t]))
-    report = import_dataset(tmp_path / "lr", tmp_path / "out", "unreal", reference=tmp_path / "hr")
+    report = import_dataset(tmp_path / "lr", tmp_path / "out", "unreal", recipe=raw, reference=tmp_path / "hr")
     got = imported(report, "shot_010")
     validate_sequence(got, "shot_010", ("base_color", "normal"))
     for t in range(1, 4):
@@ -155,20 +204,20 @@ def test_unreal_device_depth_by_a_recipe_of_four_lines(tmp_path):
     """Reversed-Z with an infinite far plane: near / z, near = 10 cm; the sky is 0."""
     known = truth(T=2)
     device = 10.0 / (known.frames.gbuffers.depth * CM)
-    write_unreal(tmp_path / "lr", known, np.ones((2, H, W, 1), bool), depth=device)
+    write_unreal(tmp_path / "lr", known, depth=device)
     (tmp_path / "my.toml").write_text('[depth]\nkind = "reversed"\nnear = 10\n')
     report = import_dataset(tmp_path / "lr", tmp_path / "out", "unreal", recipe=tmp_path / "my.toml")
     assert_like(imported(report, "shot_010").frames.gbuffers.depth, known.frames.gbuffers.depth, "depth", rtol=1e-5)
     assert report.sequence.source["depth"]["kind"] == "reversed"
 
 
-def test_unreal_without_cameras_says_what_to_do(tmp_path):
+def test_unreal_without_cameras_says_what_to_do(tmp_path, raw):
     known = truth(T=2)
     write_unreal(tmp_path / "lr", known, known.valid > 0.5, header=False)
     with pytest.raises(
         ValueError, match=r"frame 1: .*shot_010\.0001\.exr: \d+ pixels have no velocity.*write velocity"
     ):
-        import_dataset(tmp_path / "lr", tmp_path / "out", "unreal")
+        import_dataset(tmp_path / "lr", tmp_path / "out", "unreal", recipe=raw)
 
 
 def test_unreal_rotator_by_hand():
@@ -201,11 +250,12 @@ def write_arm(folder, known, name="0007", *, reverse=True, far=-1.0, near=0.25, 
             {
                 "Frame": t, "CameraNearPlane": near, "CameraFarPlane": far, "Exposure": 1.5 + t,
                 "CameraCut": t == cut_at,
-                "NormalizedPerRatioJitter": [{"X": 9.0, "Y": 9.0}, {"X": float(x), "Y": float(y)}],
+                "NormalizedPerRatioJitter": [{"X": 0.4 / W, "Y": 0.4 / H}, {"X": float(x), "Y": float(y)}],
             }
         )  # fmt: skip
     content = {"ReverseZ": reverse, "UpscalingRatiosIndices": {"x1_5_index": 0, "x2_index": 1}, "Frames": records}
-    (folder / f"{name}.json").write_text(json.dumps({**content, **changes}))
+    content |= {"TargetResolution": {"X": 2 * W, "Y": 2 * H}, **changes}
+    (folder / f"{name}.json").write_text(json.dumps(content))
 
 
 @pytest.mark.parametrize(("reverse", "far"), [(True, -1.0), (False, -1.0), (True, 40.0)])
@@ -228,12 +278,44 @@ def test_arm_nss(tmp_path, reverse, far):
     assert report.dataset.splits == {"test": (("0007", 0, 3, 0), ("0008", 0, 3, 0))}
 
 
+@pytest.mark.parametrize(("ratio", "index"), [(1.5, 0), (2, 1)])
+def test_arm_jitter_of_the_frames_ratio(tmp_path, ratio, index):
+    """The target's width says which ratio it is; and dilated motion is recorded."""
+    size = {"X": round(ratio * W), "Y": round(ratio * H)}
+    known = truth(T=2)
+    write_arm(tmp_path / "dump", known, TargetResolution=size, MotionVectorsDilated=True)
+    report = import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
+    expected = known.frames.jitter if index else np.full((2, 2), 0.4)
+    assert_like(imported(report, "0007").frames.jitter, expected, "jitter")
+    assert report.sequence.source["motion"]["dilated"] is True
+
+
+def test_arm_with_one_ratio_needs_no_index(tmp_path):
+    known = truth(T=2)
+    write_arm(tmp_path / "dump", known)
+    path = tmp_path / "dump" / "0007.json"
+    content = json.loads(path.read_text())
+    del content["UpscalingRatiosIndices"]
+    for record in content["Frames"]:
+        record["NormalizedPerRatioJitter"] = record["NormalizedPerRatioJitter"][1:]
+    path.write_text(json.dumps(content))
+    report = import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
+    assert_like(imported(report, "0007").frames.jitter, known.frames.jitter, "jitter")
+    assert report.sequence.source["motion"]["dilated"] is False
+
+
 def test_arm_errors(tmp_path):
     write_arm(tmp_path / "dump", truth(T=2), GTColorSpace="sRGB")
     with pytest.raises(ValueError, match=r"0007\.json: expected GTColorSpace Linear, got 'sRGB'"):
         import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
     write_arm(tmp_path / "dump", truth(T=2), UpscalingRatiosIndices={"x1_5_index": 0})
-    with pytest.raises(ValueError, match=r"0007\.json: expected Frames and UpscalingRatiosIndices x2_index"):
+    with pytest.raises(ValueError, match=r"0007\.json: UpscalingRatiosIndices has x1_5_index, but the target is 2 "):
+        import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
+    write_arm(tmp_path / "dump", truth(T=2), TargetResolution=None)
+    with pytest.raises(ValueError, match=r"0007\.json: expected TargetResolution and UpscalingRatiosIndices"):
+        import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
+    write_arm(tmp_path / "dump", truth(T=2), UpscalingRatiosIndices=None)
+    with pytest.raises(ValueError, match=r"frame 0: .*2 entries of NormalizedPerRatioJitter, and no UpscalingRatiosIn"):
         import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
     write_arm(tmp_path / "dump", truth(T=3))
     content = json.loads((tmp_path / "dump" / "0007.json").read_text())
