@@ -16,7 +16,7 @@ from essjax.color import display
 from essjax.data import Dataset, Segment, read_segment
 from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
 from essjax.interfaces import Method
-from essjax.metrics import aggregate, psnr, score_rollout
+from essjax.metrics import aggregate, mean_over, psnr, score_rollout
 from essjax.rollout import ESS, SS, Schedule, alternate, check_supported, every, stream_step
 from essjax.typing import Array, PyTree
 from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
@@ -253,7 +253,7 @@ def _ordered(shown: Mapping[tuple, dict]) -> list[dict]:
 
 
 def _summarise(curves: Mapping[str, Mapping[str, list]]) -> list[dict[str, Any]]:
-    """Means over frames per sequence, and over sequences ("mean")."""
+    """Means over frames per sequence, and over sequences ("mean"); none where frames are not finite."""
     rows = []
     for method, sequences in curves.items():
         for kind in (SS, ESS):
@@ -269,9 +269,6 @@ def _summarise(curves: Mapping[str, Mapping[str, list]]) -> list[dict[str, Any]]
 
 
 def _row(method: str, sequence: str, kind: str, entries: list[dict]) -> dict[str, Any]:
-    extra = {}
-    for name in EXTRA_METRICS:
-        values = [entry[name] for entry in entries if entry.get(name) is not None]
-        extra[name] = sum(values) / len(values) if values else None
+    extra = {name: mean_over(entries, name) for name in EXTRA_METRICS}
     labels = {"method": method, "sequence": sequence, "frames": kind, "resolution": entries[0]["resolution"]}
     return {**labels, **aggregate(entries), **extra}

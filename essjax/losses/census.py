@@ -6,7 +6,7 @@ becomes the soft sign ``d / sqrt(0.81 + d^2)``, and two soft signs that differ b
 
 import jax.numpy as jnp
 
-from essjax.losses.pixel import check_same_shape
+from essjax.losses.pixel import as_float32
 from essjax.typing import Array, Color, Image, Plane
 
 GREY = (0.2989, 0.5870, 0.1140)
@@ -62,7 +62,7 @@ def census(prediction: Color, target: Color, *, window: int = 7) -> Plane:
     Raises:
       ValueError: the shapes differ, the window is even, or the image is smaller than the window.
     """
-    check_same_shape(prediction, target)
+    prediction, target = as_float32(prediction, target)
     if prediction.shape[-1] == 3:
         prediction, target = _grey(prediction), _grey(target)
     elif prediction.shape[-1] != 1:
@@ -85,5 +85,5 @@ def feature_census(prediction: Image, target: Image, *, window: int = 3) -> Plan
     Raises:
       ValueError: the shapes differ, the window is even, or the map is smaller than the window.
     """
-    check_same_shape(prediction, target)
+    prediction, target = as_float32(prediction, target)
     return _census_distance(prediction, target, window)

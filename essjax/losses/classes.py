@@ -7,11 +7,11 @@ from essjax.typing import Array, Image, Int, Mask, Plane
 
 
 def cross_entropy(logits: Image, classes: Int[Array, "... h w 1"]) -> Plane:
-    """``-log softmax(logits)[class]``, ``[..., H, W, 1]``, in float32.
+    """``-log softmax(logits)[class]``, ``[..., H, W, 1]``, in float32; NaN where the class is outside 0 ... K-1.
 
     Args:
       logits: ``[..., H, W, K]``.
-      classes: ``[..., H, W, 1]`` in 0 ... K-1.
+      classes: ``[..., H, W, 1]`` in 0 ... K-1; hide others by the mask of ``masked_mean``.
 
     Raises:
       ValueError: the sizes differ.
@@ -22,7 +22,8 @@ def cross_entropy(logits: Image, classes: Int[Array, "... h w 1"]) -> Plane:
             f"got {tuple(classes.shape)}."
         )
     chosen = jax.nn.one_hot(classes[..., 0], logits.shape[-1], dtype=jnp.float32)  # no gather: its gradient is slow
-    return -jnp.sum(chosen * jax.nn.log_softmax(logits.astype(jnp.float32)), axis=-1, keepdims=True)
+    loss = -jnp.sum(chosen * jax.nn.log_softmax(logits.astype(jnp.float32)), axis=-1, keepdims=True)
+    return jnp.where((classes >= 0) & (classes < logits.shape[-1]), loss, jnp.nan)
 
 
 def class_weights(
@@ -31,7 +32,7 @@ def class_weights(
     """Weight of every pixel, ``mask / share^balance`` of its class's share of the mask, scaled to sum up like the mask.
 
     Args:
-      classes: ``[..., H, W, 1]`` in 0 ... ``count`` - 1.
+      classes: ``[..., H, W, 1]`` in 0 ... ``count`` - 1; others weigh 0.
       count: number of classes.
       mask: ``[..., H, W, 1]``, 1 where a pixel counts.
       balance: 0 weighs pixels alike, 1 classes alike.

@@ -10,16 +10,16 @@ from essjax.typing import Array, Color, Image, Mask
 def masked_mean(values: Image, mask: Mask, *, axis: int | tuple[int, ...] | None = None) -> Array:
     """Mean of ``values`` weighted by ``mask``; 0, with a zero gradient, where the mask is empty.
 
-    Values under a zero mask are not read: they may be inf or NaN.
+    Values under a zero mask are not read: they may be inf or NaN. Sums and mean are float32.
 
     Args:
       values: ``[..., H, W, C]``.
       mask: >= 0, broadcasts against ``values``; ``[..., H, W, 1]`` weighs all channels alike.
       axis: axes to reduce; all if None.
     """
-    mask = jnp.broadcast_to(mask, values.shape)
+    mask = jnp.broadcast_to(mask, values.shape).astype(jnp.float32)
     # The inner select keeps inf and NaN out of the product, whose gradient would spread them.
-    total = jnp.sum(jnp.where(mask > 0, values, 0.0) * mask, axis=axis)
+    total = jnp.sum(jnp.where(mask > 0, values.astype(jnp.float32), 0.0) * mask, axis=axis)
     weight = jnp.sum(mask, axis=axis)
     return jnp.where(weight > 0, total / jnp.where(weight > 0, weight, 1.0), 0.0)
 

@@ -5,7 +5,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.losses.pixel import check_same_shape
+from essjax.losses.pixel import as_float32
 from essjax.typing import Image
 
 
@@ -40,9 +40,9 @@ def ssim_map(
       c2: stabiliser of the variances; 0.03^2 as Wang et al., 0.02^2 in DLCTUS' tables.
 
     Raises:
-      ValueError: the shapes differ, the window is even, or the image is smaller than the window.
+      ValueError: the shapes differ, an image holds integers or is smaller than the window, or the window is even.
     """
-    check_same_shape(prediction, target)
+    prediction, target = as_float32(prediction, target)
     if window % 2 == 0 or min(prediction.shape[-3:-1]) < window:
         raise ValueError(
             f"ssim: expected an odd window no larger than the image, got window {window} for "

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from essjax.losses.pixel import check_same_shape, l1
+from essjax.losses.pixel import as_float32, l1
 from essjax.typing import Array, Color, Image, Mask
 
 
@@ -22,7 +22,7 @@ def temporal_l1(image: Color, warped_previous: Color, valid: Mask) -> Color:
     Raises:
       ValueError: the images' shapes differ.
     """
-    check_same_shape(image, warped_previous, ("image", "warped_previous"))
+    image, warped_previous = as_float32(image, warped_previous, ("image", "warped_previous"))
     return jnp.where(valid > 0, valid * jnp.abs(image - warped_previous), 0.0)
 
 
@@ -39,7 +39,7 @@ def spatio_temporal(error: Image, error_previous: Image, *, theta: float) -> Ima
     Raises:
       ValueError: the shapes differ, or ``theta`` is outside [0, 1].
     """
-    check_same_shape(error, error_previous, ("error", "error_previous"))
+    error, error_previous = as_float32(error, error_previous, ("error", "error_previous"))
     if not 0.0 <= theta <= 1.0:
         raise ValueError(f"theta: expected a share in [0, 1], got {theta}.")
     return (1.0 - theta) * (jnp.abs(error) + jnp.abs(error_previous)) + theta * jnp.abs(error - error_previous)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from essjax.losses import masked_mean
-from essjax.losses.pixel import check_same_shape
+from essjax.losses.pixel import as_float32
 from essjax.typing import Image, Mask, Scalar
 
 PIXEL_AXES = (-3, -2, -1)
@@ -18,7 +18,7 @@ def psnr(prediction: Image, target: Image, *, mask: Mask | None = None) -> Scala
     PSNRs, not the PSNR of the mean error.
 
     Args:
-      prediction: ``[..., H, W, C]`` display-referred in [0, 1] (``essjax.color.display``).
+      prediction: ``[..., H, W, C]`` display-referred in [0, 1] (``essjax.color.display``); computed in float32.
       target: the same shape.
       mask: ``[..., H, W, 1]``, 1 where to look; all pixels if None.
 
@@ -26,9 +26,9 @@ def psnr(prediction: Image, target: Image, *, mask: Mask | None = None) -> Scala
       ``[...]``; NaN where the mask is empty: there is nothing to score.
 
     Raises:
-      ValueError: the shapes differ.
+      ValueError: the shapes differ, or an image holds integers.
     """
-    check_same_shape(prediction, target)
+    prediction, target = as_float32(prediction, target)
     squared = (prediction - target) ** 2
     if mask is None:
         error = jnp.mean(squared, axis=PIXEL_AXES)

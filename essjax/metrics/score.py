@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.color import display
-from essjax.losses.pixel import check_same_shape
+from essjax.losses.pixel import as_float32
 from essjax.metrics.psnr import psnr
 from essjax.metrics.ssim import ssim
 from essjax.metrics.temporal import spatio_temporal_error, tpsnr, warped_error
@@ -51,13 +51,14 @@ def score_rollout(
     Returns:
       frame index -> ``{"kind": ..., metric: float or None}`` for every name in ``METRICS``: dB for the PSNRs, shares
       and mean absolute differences in [0, 1] for the rest. None where a metric does not exist (frame 0 has no
-      predecessor; fewer than ``MIN_HOLE_PIXELS`` pixels are holes).
+      predecessor; fewer than ``MIN_HOLE_PIXELS`` pixels are holes) or is not finite; ``"non_finite"`` is 1 where image
+      or target, of this frame or of the one before, hold NaN or infinity, else 0.
 
     Raises:
-      ValueError: shapes differ, or a frame index or the number of kinds does not fit.
+      ValueError: shapes differ, images hold integers, or a frame index or the number of kinds does not fit.
     """
     length = images.shape[0]
-    check_same_shape(images, targets, ("images", "targets"))
+    images, targets = as_float32(images, targets, ("images", "targets"))
     if len(kinds) != length:
         raise ValueError(f"kinds: expected one per frame, {length}, got {len(kinds)}.")
     outside = [n for n in scored if not 0 <= n < length]
@@ -80,7 +81,7 @@ def score_rollout(
         values = {name: _number(columns[name][k]) if name in columns else None for name in METRICS}
         if n == 0:
             values |= dict.fromkeys(NEED_THE_PREVIOUS_FRAME)
-        rows[n] = {"kind": kinds[n], **values}
+        rows[n] = {"kind": kinds[n], **values, "non_finite": int(columns["non_finite"][k])}
     return rows
 
 
@@ -93,6 +94,7 @@ def _score_frames(batch: tuple[Color, ...], holes: Mask | None, motion: Motion |
 def _score_frame(batch: tuple[Color, ...], hole: Mask | None, motion: Motion | None) -> dict[str, Array]:
     image, image_before, target, target_before = (display(picture) for picture in batch)
     result = {
+        "non_finite": ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(picture)) for picture in batch])),
         "psnr": psnr(image, target),
         "ssim": ssim(image, target),
         "ssim_dlctus": ssim(image, target, c2=0.02**2),
@@ -115,6 +117,23 @@ def _number(value: np.ndarray) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def mean_over(rows: Iterable[Mapping[str, Any]], name: str) -> float | None:
+    """Mean of one metric over frames (or over sequences) that have it.
+
+    Args:
+      rows: dictionaries as ``score_rollout`` (or ``aggregate``) returns them.
+      name: of the metric.
+
+    Returns:
+      None where no row has it, and where one with ``"non_finite"`` frames lacks it: a mean of what is left would look
+      better than the images are.
+    """
+    rows = list(rows)
+    values = [row[name] for row in rows if row.get(name) is not None]
+    spoiled = any(row.get(name) is None and row.get("non_finite") for row in rows)
+    return math.fsum(values) / len(values) if values and not spoiled else None
+
+
 def aggregate(rows: Iterable[Mapping[str, Any]]) -> dict[str, float | None]:
     """Mean of every metric over frames (or over sequences): the mean of PSNRs, not the PSNR of a mean.
 
@@ -122,11 +141,9 @@ def aggregate(rows: Iterable[Mapping[str, Any]]) -> dict[str, float | None]:
       rows: dictionaries as ``score_rollout`` returns them; entries that are not numbers are left out.
 
     Returns:
-      metric -> mean over the rows that have it, None where none has; and ``"frame_count"``, the number of rows.
+      metric -> its ``mean_over`` the rows; ``"frame_count"``, the number of rows; and ``"non_finite"``, how many frames
+      hold NaN or infinity, or follow one that does.
     """
     rows = list(rows)
-    result: dict[str, float | None] = {}
-    for name in METRICS:
-        values = [row[name] for row in rows if row.get(name) is not None]
-        result[name] = math.fsum(values) / len(values) if values else None
-    return {**result, "frame_count": len(rows)}
+    means = {name: mean_over(rows, name) for name in METRICS}
+    return {**means, "frame_count": len(rows), "non_finite": sum(row.get("non_finite", 0) for row in rows)}

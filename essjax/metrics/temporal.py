@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from essjax.losses import masked_mean, spatio_temporal
-from essjax.losses.pixel import check_same_shape
+from essjax.losses.pixel import as_float32, check_same_shape
 from essjax.metrics.psnr import PIXEL_AXES, psnr
 from essjax.typing import Image, Mask, Motion, Scalar
 from essjax.warp import backward_warp
@@ -15,8 +15,10 @@ def flicker(prediction: Image, prediction_previous: Image, target: Image, target
     Raises:
       ValueError: the shapes of the frames differ.
     """
-    check_same_shape(prediction, prediction_previous, ("prediction", "prediction_previous"))
-    check_same_shape(target, target_previous, ("target", "target_previous"))
+    prediction, prediction_previous = as_float32(
+        prediction, prediction_previous, ("prediction", "prediction_previous")
+    )
+    target, target_previous = as_float32(target, target_previous, ("target", "target_previous"))
     check_same_shape(prediction, target)
     return (prediction - prediction_previous) - (target - target_previous)
 
@@ -61,8 +63,10 @@ def spatio_temporal_error(
     Raises:
       ValueError: the shapes differ, or ``theta`` is outside [0, 1].
     """
-    check_same_shape(prediction, target)
-    check_same_shape(prediction_previous, target_previous)
+    prediction, target = as_float32(prediction, target)
+    prediction_previous, target_previous = as_float32(
+        prediction_previous, target_previous, ("prediction_previous", "target_previous")
+    )
     previous = backward_warp(prediction_previous - target_previous, motion)
     return jnp.mean(spatio_temporal(prediction - target, previous, theta=theta), axis=PIXEL_AXES)
 
@@ -81,7 +85,7 @@ def warped_error(image: Image, image_previous: Image, motion: Motion, *, valid: 
     Raises:
       ValueError: the shapes differ.
     """
-    check_same_shape(image, image_previous, ("image", "image_previous"))
+    image, image_previous = as_float32(image, image_previous, ("image", "image_previous"))
     error = jnp.abs(image - backward_warp(image_previous, motion))
     if valid is None:
         return jnp.mean(error, axis=PIXEL_AXES)

@@ -47,7 +47,7 @@ class Cell(NamedTuple):
 
 
 class Line(NamedTuple):
-    """One method's line: cells in the order of kinds, then ``COLUMNS``; ``remark`` where it is not comparable."""
+    """One method's line: cells by kinds, then ``COLUMNS``; ``remark`` where it is not comparable or not finite."""
 
     method: str
     cells: list[Cell]
@@ -129,7 +129,9 @@ def make_table(
             value = values[method, kind, column.key]
             marked = value is not None and method in comparable and value == best[kind, column.key]
             cells.append(Cell(_text(value, rows.get((method, kind)), column), marked))
-        lines.append(Line(method, cells, references.get(method, "")))
+        spoiled = sum((rows.get((method, kind)) or {}).get("non_finite", 0) for kind in kinds)
+        lost = f"NaN or infinity in or just before {spoiled} frames: no mean of what they spoil" if spoiled else ""
+        lines.append(Line(method, cells, "; ".join(filter(None, (references.get(method), lost)))))
     shares = [row["hole_share"] for row in rows.values() if row.get("hole_share") is not None]
     holes = f" (holes: {100 * sum(shares) / len(shares):.1f} % of the pixels)" if shares else ""
     return Table(RESOLUTION_NAMES[resolution] + holes, sequence, kinds, lines)

@@ -201,6 +201,17 @@ def test_table_order_best_and_references():
     assert without.lines[0].method == "taau" or without.lines[0].cells[0].text != "31.00"
 
 
+def test_frames_that_are_not_finite_stand_in_the_remark():
+    metrics = make_metrics()
+    for row in metrics["rows"]:
+        if row["method"] in ("bilinear", "taau") and row["frames"] == "ss":
+            row |= {"psnr": None, "non_finite": 3}
+    lines = {line.method: line for line in make_table(metrics, "hr", "mean", REFERENCES).lines}
+    expected = "NaN or infinity in or just before 3 frames: no mean of what they spoil"
+    assert lines["bilinear"].remark == expected and lines["bilinear"].cells[0] == ("–", False)
+    assert lines["taau"].remark == f"{REFERENCES['taau']}; {expected}" and lines["extrass"].remark == ""
+
+
 def test_headline_names_the_best_comparable_rival():
     assert headline(make_metrics(), REFERENCES) == (
         "extrass: 29.00 dB on rendered frames (+1.00 against taau-half), "

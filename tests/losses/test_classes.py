@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from essjax.losses import class_weights, cross_entropy
+from essjax.losses import class_weights, cross_entropy, masked_mean
 from tests.helpers import random_image
 
 
@@ -19,6 +19,15 @@ def test_cross_entropy_equals_numpy_and_stays_finite():
     gradient = jax.jit(jax.grad(lambda x: cross_entropy(x, classes).sum()))(logits)
     softmax = np.exp(x - np.logaddexp.reduce(x, axis=-1, keepdims=True))
     np.testing.assert_allclose(gradient, softmax - np.eye(4)[np.asarray(classes)[..., 0]], atol=1e-5)
+
+
+def test_a_class_out_of_range_costs_nan_unless_it_is_masked():
+    logits, classes = jnp.zeros((1, 3, 4)), jnp.array([[[9], [-1], [3]]])
+    np.testing.assert_allclose(cross_entropy(logits, classes)[0, :, 0], [np.nan, np.nan, np.log(4)], rtol=1e-6)
+    mask = jnp.array([[[0.0], [0.0], [1.0]]])
+    assert float(masked_mean(cross_entropy(logits, classes), mask)) == pytest.approx(np.log(4), rel=1e-6)
+    gradient = jax.grad(lambda x: masked_mean(cross_entropy(x, classes), mask))(logits)
+    np.testing.assert_allclose(gradient[0], [[0] * 4, [0] * 4, [0.25, 0.25, 0.25, -0.75]], atol=1e-6)
 
 
 def test_weights_by_hand():

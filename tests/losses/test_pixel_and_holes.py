@@ -50,6 +50,21 @@ def test_shapes_that_would_broadcast_are_refused(loss):
         loss(jnp.zeros((5, 7, 3)), jnp.zeros((5, 7, 1)))
 
 
+@pytest.mark.parametrize("loss", [l1, charbonnier])
+def test_sixteen_bit_images_are_compared_in_float32_and_integers_refused(loss):
+    """1 + 2^-8 squared needs more than 8 bits."""
+    a, b = jnp.array([[[2.0]]], jnp.bfloat16), jnp.array([[[0.9921875]]], jnp.bfloat16)
+    assert loss(a, b).dtype == jnp.float32 and float(loss(a, b)[0, 0, 0]) == pytest.approx(1.0078125, rel=1e-6)
+    with pytest.raises(ValueError, match="prediction: expected floating-point values, got uint8"):
+        loss(a.astype(jnp.uint8), b.astype(jnp.uint8))
+
+
+def test_masked_mean_of_sixteen_bits_sums_in_float32():
+    """256 x 256 ones sum to 65536, beyond float16."""
+    ones = jnp.ones((256, 256, 1), jnp.float16)
+    assert float(masked_mean(ones, ones)) == 1.0 and masked_mean(ones, ones).dtype == jnp.float32
+
+
 @given(seed=SEEDS)
 def test_masked_mean_matches_numpy(seed):
     values, mask = random_image(seed, *SHAPE), random_image(seed + 1, *SHAPE[:-1], 1, high=1.0)

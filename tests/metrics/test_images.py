@@ -66,6 +66,32 @@ def test_ssim_mask_counts_window_centres():
     assert np.isnan(ssim(a, b, mask=jnp.zeros_like(mask))).all()
 
 
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_sixteen_bit_images_score_as_the_same_numbers_in_float32(dtype):
+    short = [image.astype(dtype) for image in pair(1)]
+    wide = [image.astype(jnp.float32) for image in short]
+    for metric in (psnr, ssim):
+        assert metric(*short).dtype == jnp.float32
+        np.testing.assert_allclose(metric(*short), metric(*wide), rtol=1e-6)
+    assert float(psnr(short[0], short[0])[0]) == MAX_PSNR
+
+
+def test_a_mask_of_many_pixels_does_not_overflow_in_float16():
+    """Half the range off on 260 x 260 > 65504 pixels: -10 log10(0.25)."""
+    image, mask = jnp.full((260, 260, 1), 0.5, jnp.float16), jnp.ones((260, 260, 1), jnp.float16)
+    assert float(psnr(image, 0 * image, mask=mask)) == pytest.approx(6.0206, abs=1e-4)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_integers_are_refused(metric):
+    image = np.zeros((20, 18, 3), np.uint8)
+    message = r"prediction: expected floating-point values, got uint8. Divide by the largest integer \(255\) first"
+    with pytest.raises(ValueError, match=message):
+        metric(image, image)
+    with pytest.raises(ValueError, match="target: expected floating-point values, got int32"):
+        metric(jnp.zeros((20, 18, 3)), jnp.zeros((20, 18, 3), jnp.int32))
+
+
 def test_messages():
     image = jnp.zeros((20, 8, 3))
     with pytest.raises(ValueError, match="expected the same shape"):

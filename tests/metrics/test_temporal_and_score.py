@@ -93,7 +93,7 @@ def test_first_frame_and_missing_masks(rollout):
     first = score_rollout(**rollout, scored=[0], kinds=KINDS)[0]
     assert first["tpsnr"] is None and first["warped_error"] is None and first["psnr"] > 0
     bare = score_rollout(rollout["images"], rollout["targets"], scored=[1], kinds=KINDS)[1]
-    assert set(bare) == {"kind", *METRICS}
+    assert set(bare) == {"kind", *METRICS, "non_finite"} and bare["non_finite"] == 0
     assert bare["tpsnr"] > 0
     assert all(bare[name] is None for name in ("psnr_holes", "hole_share", "warped_error", "warped_error_reference"))
     assert score_rollout(**rollout, scored=[], kinds=KINDS) == {}
@@ -102,8 +102,36 @@ def test_first_frame_and_missing_masks(rollout):
 def test_aggregate_is_the_mean_of_what_is_there():
     mean = aggregate([{"psnr": 20.0, "psnr_holes": None}, {"psnr": 30.0, "psnr_holes": 12.0, "kind": "ss"}])
     assert mean["psnr"] == 25.0 and mean["psnr_holes"] == 12.0 and mean["ssim"] is None and mean["frame_count"] == 2
-    assert set(mean) == {*METRICS, "frame_count"}
+    assert set(mean) == {*METRICS, "frame_count", "non_finite"} and mean["non_finite"] == 0
     assert aggregate([])["psnr"] is None
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_image_that_is_not_finite_cannot_improve_a_mean(rollout, value):
+    """The bad frame would be left out of a mean of numbers: 1 of 2 frames, the better one."""
+    images = rollout["images"].at[2, 3, 4, 0].set(value)
+    rows = score_rollout(**{**rollout, "images": images}, scored=[1, 2, 3, 4], kinds=KINDS)
+    assert [row["non_finite"] for row in rows.values()] == [0, 1, 1, 0]  # frame 3's temporal metrics read frame 2
+    assert rows[2]["psnr"] is None and rows[3]["psnr"] > 0 and rows[3]["tpsnr"] is None
+    mean = aggregate(rows.values())
+    assert mean["psnr"] is None and mean["ssim"] is None and mean["tpsnr"] is None
+    assert mean["non_finite"] == 2 and mean["frame_count"] == 4
+    extrapolated = aggregate([rows[1], rows[3]])
+    assert extrapolated["psnr"] > 0 and extrapolated["tpsnr"] is None and extrapolated["non_finite"] == 1
+    over_sequences = aggregate([mean, aggregate([rows[1], rows[4]])])
+    assert over_sequences["psnr"] is None and over_sequences["non_finite"] == 2
+    bad_target = score_rollout(**{**rollout, "targets": images}, scored=[2], kinds=KINDS)
+    assert bad_target[2]["non_finite"] == 1
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_sixteen_bit_frames_score_as_the_same_numbers_in_float32(rollout, dtype):
+    short = {**rollout, "images": rollout["images"].astype(dtype), "targets": rollout["targets"].astype(dtype)}
+    wide = {name: value.astype(jnp.float32) for name, value in short.items()}
+    assert score_rollout(**short, scored=[2], kinds=KINDS) == score_rollout(**wide, scored=[2], kinds=KINDS)
+    pictures = [0.1 * short["images"][n] for n in range(4)]
+    expected = tpsnr(*(picture.astype(jnp.float32) for picture in pictures))
+    assert float(tpsnr(*pictures)) == pytest.approx(float(expected), rel=1e-6)
 
 
 def test_messages(rollout):
@@ -113,5 +141,8 @@ def test_messages(rollout):
         score_rollout(**rollout, scored=[2, 5], kinds=KINDS)
     with pytest.raises(ValueError, match=r"holes: expected \(5, 13, 18\) as the images, got \(5, 6, 9\)"):
         score_rollout(**{**rollout, "holes": jnp.zeros((5, 6, 9, 1))}, scored=[2], kinds=KINDS)
+    whole = rollout["images"].astype(jnp.uint8)
+    with pytest.raises(ValueError, match="images: expected floating-point values, got uint8"):
+        score_rollout(whole, whole, scored=[2], kinds=KINDS)
     with pytest.raises(ValueError, match="images and targets: expected the same shape"):
         score_rollout(rollout["images"][:3], rollout["targets"], scored=[2], kinds=KINDS)
