@@ -190,6 +190,29 @@ def test_broken_frames_keep_their_reason_and_repaired_ones_are_not_ignored(tmp_p
         run(skip_broken=True)
 
 
+def test_a_clip_that_grows_in_a_dataset_may_be_interrupted(tmp_path, run):
+    shot, known = tmp_path / "dump" / "shot", truth(T=8)
+    write_shot(shot, known)
+    for n in range(3, 8):
+        for path in shot.glob(f"*.{n:04d}.exr"):
+            path.rename(tmp_path / path.name)
+    assert run().sequence.numbers == (0, 1, 2)
+    for path in tmp_path.glob("*.exr"):
+        path.rename(shot / path.name)
+
+    def stop(done, total):
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(on_frame=stop)
+    with pytest.raises(ValueError, match=r"sequence shot is unfinished \(5 frames so far\)\. Run the command that"):
+        read_dataset(tmp_path / "out")
+    report = run()
+    assert report.sequence.numbers == tuple(range(8)) and not report.skipped
+    np.testing.assert_array_equal(read_sequence(report.dataset, "shot").frames.motion, known.frames.motion)
+
+
 def test_frames_between_are_refused(tmp_path, run):
     shot = tmp_path / "dump" / "shot"
     write_shot(shot, truth(T=4), numbers=[0, 1, 3, 4])
