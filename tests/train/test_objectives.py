@@ -121,10 +121,23 @@ def test_extrass_terms_equal_numpy(exact_masks):
         levels = difference[..., ::2, ::2, :], 3.0 * difference[..., :1]
         expected[f"vgg_{name}"] = 0.5 * sum((level**2).mean() for level in levels)
     for a, b in zip(FEATURES[0], FEATURES[1], strict=True):
-        expected["features"] += 3.0 * (np.abs(a - b) * brightness).mean()
+        expected["features"] += 3.0 * (np.abs(a - b) * brightness[1:]).mean()  # frame 1 is left out
     assert set(terms) == set(expected)
     for name, value in expected.items():
         np.testing.assert_allclose(terms[name], value, rtol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize(("length", "expected"), [(3, 0.0), (7, 3.0)])
+def test_features_are_compared_where_both_encoders_see_history(length, expected):
+    """E0's are 9 where there is no history (frame 1), else 1; E1's are 0. Of three frames none is left."""
+
+    def aux(variables, history, frame, kind):
+        value = jnp.where(history[..., 0] < 0, 9.0, 1.0) * (1 - kind)
+        level = jnp.broadcast_to(value[..., None, None, None], (*value.shape, 2, 3, 4))
+        return {**extrass_aux(variables, history, frame, kind), "features": [level]}
+
+    terms, _ = jax.jit(extrass_objective(fake(aux), temporal_weight=3.0))({}, numbered(length))
+    np.testing.assert_allclose(terms["features"], expected, rtol=1e-6)
 
 
 def test_without_vgg_there_is_no_such_term():

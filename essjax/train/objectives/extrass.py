@@ -65,7 +65,7 @@ def extrass_objective(
     temporal_weight: float = 1.0,
     vgg_features: Callable | None = None,
 ) -> Objective:
-    """L of ExtraSS eq 11-14 over both kinds of every frame but the first.
+    """L of ExtraSS eq 11-14 over both kinds of every inner frame of a clip; features are compared from frame 2 on.
 
     Args:
       method: ``extrass``.
@@ -93,9 +93,12 @@ def extrass_objective(
             if vgg_features is not None:
                 difference = perceptual(expm1(image), expm1(target), vgg_features)
                 terms[f"vgg_{kind}"] = vgg_weight * sum_of_means(difference)
+        # Without frame 1: as SS it starts a run, so E0 sees no history there, and E1 does.
+        given, features = ([level[1:] for level in kinds[kind]["features"]] for kind in (SS, ESS))
         # E1 follows E0: drawn to each other, both shrink to zero (experiments/LOG.md).
-        levels = feature_l1(jax.lax.stop_gradient(kinds[SS]["features"]), kinds[ESS]["features"])
-        terms["features"] = temporal_weight * sum_of_means(levels)
+        levels = feature_l1(jax.lax.stop_gradient(given), features)
+        # Of three frames none is left, and a mean over none is NaN.
+        terms["features"] = temporal_weight * sum_of_means([level for level in levels if level.size])
         return terms, state
 
     return objective
