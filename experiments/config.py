@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,8 +16,8 @@ class Config:
       train_frames (also of validation), test_frames, train_spp (also of validation), test_spp, mip_bias (thesis
       002: 0 for its dataset 1, -1 for its dataset 2), jitter ("halton", or "dlctus" where every frame is rendered).
     Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
-      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (decay the
-      learning rate also where a paper keeps it), fresh (new train scenes after so many steps, rendered in the meantime;
+      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (false:
+      no stage's learning rate decays), fresh (new train scenes after so many steps, rendered in the meantime;
       None: always those on disk), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
       of VGG-16 weights).
     Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
@@ -81,7 +82,7 @@ PRESETS: dict[str, Config] = {
         first_steps=100 * 900, steps=120 * 600, first_seconds=None, seconds=None, save_every=300.0, pictures=2,
     ),
 }  # fmt: skip
-"""smoke: every part runs once, under a minute on two cores. quick: the default, seven minutes. paper: the
+"""smoke: every part runs once, two minutes on two cores. quick: the default, seven minutes. paper: the
 papers' settings (an epoch: one crop from each of 120 sequences' 60 frames, 900 batches of 8 or 600 of 12)."""
 
 PRESET_NAMES = tuple(PRESETS)
@@ -143,8 +144,29 @@ def _check(config: Config) -> None:
         steps, seconds = f"{name}_steps".lstrip("_"), f"{name}_seconds".lstrip("_")
         if getattr(config, steps) is None and getattr(config, seconds) is None:
             raise ValueError(f"--set: {steps} and {seconds} are both null; give one of them.")
-    if config.fresh is not None and config.fresh < 1:
-        raise ValueError(f"--set fresh: expected at least 1 step on each round of scenes, got {config.fresh}.")
-    for name in ("clip", "train_frames", "test_frames"):
-        if getattr(config, name) < 2:
-            raise ValueError(f"--set {name}: expected at least 2 frames, got {getattr(config, name)}.")
+    for name, (least, unit) in _LEAST.items():
+        value = getattr(config, name)
+        if value is not None and not least <= value < math.inf:  # nor NaN
+            raise ValueError(f"--set {name}: expected at least {least}{unit}, got {value}.")
+    for name in _POSITIVE:
+        value = getattr(config, name)
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"--set {name}: expected a number above 0, got {value}.")
+    if not math.isfinite(config.mip_bias):
+        raise ValueError(f"--set mip_bias: expected a finite number, got {config.mip_bias}.")
+    if config.jitter not in JITTERS:
+        raise ValueError(f"--set jitter: expected one of {', '.join(JITTERS)}, got {config.jitter!r}.")
+
+
+JITTERS = ("halton", "dlctus")
+_LEAST = {
+    "seed": (0, ""), "scale": (1, ""), "train_sequences": (1, ""), "validation_sequences": (1, ""),
+    "test_sequences": (1, ""), "train_frames": (2, " frames"), "test_frames": (2, " frames"),
+    "train_spp": (1, " sample"), "test_spp": (1, " sample"), "clip": (2, " frames"), "first_batch": (1, ""),
+    "batch": (1, ""), "first_width": (1, " channel"), "width": (1, " channel"), "first_steps": (1, " step"),
+    "steps": (1, " step"), "fresh": (1, " step on each round of scenes"), "save_every": (0, " seconds"),
+    "feature_weight": (0, ""), "occlusion_weight": (0, ""), "vgg_weight": (0, ""), "temporal_weight": (0, ""),
+    "warmup": (0, " frames"), "pictures": (0, ""),
+}  # fmt: skip
+"""The smallest value of a setting, and of what."""
+_POSITIVE = ("first_learning_rate", "learning_rate", "first_seconds", "seconds")

@@ -1,7 +1,9 @@
 """What ``--variant`` can name, by paper, and what a run compares it with."""
 
+import dataclasses
 from collections.abc import Sequence
 
+from essjax.train import constant
 from experiments.config import Config, make_config
 from experiments.variants import baselines, classifier, dlctus, extranet, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
@@ -39,13 +41,19 @@ def trained_as(name: str) -> str:
 
 
 def stages_of(name: str, config: Config) -> list[Stage]:
-    """The training stages behind a variant."""
-    return get_variant(trained_as(name)).stages(config)
+    """The training stages behind a variant; without ``config.anneal`` their learning rates do not decay."""
+    stages = get_variant(trained_as(name)).stages(config)
+    return stages if config.anneal else [dataclasses.replace(stage, decay=constant) for stage in stages]
 
 
 def config_of(name: str, preset: str, overrides: list[str]) -> Config:
     """The settings of a run of ``name``: the preset, what the variant changes in it, then ``--set``."""
-    return make_config(preset, overrides, get_variant(trained_as(name)).presets)
+    variant = get_variant(trained_as(name))
+    config = make_config(preset, overrides, variant.presets)
+    if preset not in variant.crops or any(override.startswith("crop=") for override in overrides):
+        return config
+    side = variant.crops[preset] // config.scale
+    return dataclasses.replace(config, crop=(side, side))
 
 
 def compared(names: Sequence[str]) -> tuple[str, ...]:

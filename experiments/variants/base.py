@@ -20,7 +20,7 @@ class Stage:
       batch: clips per step.
       learning_rate: its peak.
       budget: when it ends.
-      decay: of the learning rate, ``progress -> factor``.
+      decay: of the learning rate, ``progress -> factor``, unless ``Config.anneal`` is false.
       ranges: its objective needs the clips' sample ranges.
       vgg: its loss has a perceptual term, which needs the weights that ``Config.vgg`` names.
     """
@@ -48,6 +48,7 @@ class Variant:
       weights: the variant whose training it takes, where only its steps differ; then ``stages`` is that one's.
       parts: variants whose variables it contains: a run shows their rows too.
       presets: preset -> settings of the training (``Config``) that this variant changes.
+      crops: preset -> side of its crops in *output* pixels, where a paper gives it so: ``crop`` then follows ``scale``.
     """
 
     summary: str
@@ -57,6 +58,7 @@ class Variant:
     weights: str | None = None
     parts: tuple[str, ...] = ()
     presets: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    crops: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
 
 def main_budget(config: Config) -> Budget:

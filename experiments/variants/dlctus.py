@@ -3,7 +3,7 @@
 from typing import Any
 
 from essjax import methods
-from essjax.train import constant, cosine, dlctus_objective
+from essjax.train import dlctus_objective
 from experiments.config import Config
 from experiments.variants.base import Stage, Variant, main_budget
 
@@ -13,13 +13,14 @@ PRESETS = {
     "quick": {"clip": 10, "learning_rate": 4e-3, "seconds": 290.0},
     "paper": {"clip": 30, "batch": 4, "learning_rate": 1e-4, "steps": EPOCHS * 1800, "anneal": False},
 }
+CROPS = {"paper": 256}
+"""Output pixels: the input is cut to 256 / f_u (section 4.3.2)."""
 
 
 def _stage(config: Config, theta: float | None, options: dict[str, Any]) -> Stage:
     method = methods.dlctus(config.scale, **options)
-    decay = cosine if config.anneal else constant
     objective = dlctus_objective(method, theta=theta)
-    return Stage("dlctus", method, objective, config.batch, config.learning_rate, main_budget(config), decay)
+    return Stage("dlctus", method, objective, config.batch, config.learning_rate, main_budget(config))
 
 
 def _trained(summary: str, *, theta: float | None = None, **options: Any) -> Variant:
@@ -28,6 +29,7 @@ def _trained(summary: str, *, theta: float | None = None, **options: Any) -> Var
         lambda config: methods.dlctus(config.scale, **options),
         lambda config: [_stage(config, theta, options)],
         presets=PRESETS,
+        crops=CROPS,
     )
 
 

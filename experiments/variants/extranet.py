@@ -10,7 +10,7 @@ from experiments.config import Config
 from experiments.variants.base import Stage, Variant, main_budget
 
 EPOCHS, FIRST_EPOCHS = 150, 20
-"""Of the paper; the cosine decay starts after the first ones (section 4.6)."""
+"""Of the paper: all (Table 3), and the first ones, after which the cosine decay starts (section 4.6)."""
 PRESETS = {
     "smoke": {"clip": 6},
     "quick": {"clip": 6, "batch": 8, "learning_rate": 1e-3, "occlusion_weight": 1.0, "seconds": 290.0},

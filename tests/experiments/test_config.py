@@ -1,7 +1,7 @@
 import pytest
 
 from experiments.config import PRESETS, make_config
-from experiments.variants import VARIANTS, compared, config_of, get_variant
+from experiments.variants import VARIANTS, compared, config_of, get_variant, stages_of
 
 
 def test_overrides_are_typed():
@@ -56,3 +56,21 @@ def test_a_variant_changes_training_alone_and_the_command_line_has_the_last_word
     changed = {"quick": {"batch": 2, "width": 5}}
     config = make_config("quick", ["width=7"], changed)
     assert (config.batch, config.width) == (2, 7) and make_config("smoke", [], changed) == PRESETS["smoke"]
+
+
+@pytest.mark.parametrize("name", [name for name, variant in VARIANTS.items() if variant.stages(PRESETS["smoke"])])
+def test_anneal_is_a_switch_of_every_stage(name):
+    """Without it each stage keeps its peak; with it (the default of ``quick``) each one decays."""
+    kept = [stage.decay(1.0) for stage in stages_of(name, config_of(name, "quick", ["anneal=false"]))]
+    decayed = [stage.decay(1.0) for stage in stages_of(name, config_of(name, "quick", []))]
+    assert kept == [1.0] * len(decayed) and max(decayed) < 0.1 and decayed
+
+
+def test_a_crop_that_a_paper_gives_in_output_pixels_follows_the_scale():
+    """Thesis 002, section 4.3.2: 256 / f_u."""
+    for name in ("dlctus", "dlctus-theta-0.5", "dlctus-dilated", "nsrr"):
+        for scale, side in ((2, 128), (4, 64)):
+            assert config_of(name, "paper", [f"scale={scale}"]).crop == (side, side), name
+        assert config_of(name, "paper", ["scale=4", "crop=[40,32]"]).crop == (40, 32)
+        assert config_of(name, "quick", ["scale=4"]).crop == PRESETS["quick"].crop
+    assert config_of("extrass", "paper", ["scale=4"]).crop == PRESETS["paper"].crop  # not said there
