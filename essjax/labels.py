@@ -52,7 +52,7 @@ class Thresholds(NamedTuple):
 
     @classmethod
     def of_height(cls, height: int) -> "Thresholds":
-        """The paper's, which are of 1080 rows, for images of ``height`` rows.
+        """The paper's, which we take to be of 1080 rows, for images of ``height`` rows (docs/deviations.md).
 
         From pixel to pixel a plane's depth changes the more the fewer there are: with the same T_D^A all of a floor
         would be an edge (34 % of the pixels of 136 rows, 10 % with this one). A shadow's edge moves by fewer pixels.

@@ -190,7 +190,8 @@ def taau(
 
     Args:
       scale: whole number.
-      alpha: share of the current sample, (0, 1]; 1 / alpha bounds the effective number of samples (eq 37).
+      alpha: share of the current sample, (0, 1]. "bounded": N is at most 1 / alpha, our reading; "constant": there are
+        at most (2 - alpha) / alpha effective samples (eq 37).
       sigma: standard deviation of the Gaussian, output pixels.
       clamp: "none", "rgb" or "ycocg": history must be in the box from minimum to maximum of the nearest 3 x 3 samples.
       dilate: take motion from the nearest surface of the 3 x 3 neighbourhood, so that silhouettes keep their history.
