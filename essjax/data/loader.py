@@ -1,9 +1,10 @@
-"""Batches of training clips from any source of sequences: read from disk or rendered live, held in memory."""
+"""Batches of training clips from any source of sequences: a list, a dataset on disk, or scenes rendered live."""
 
 import dataclasses
+import os
 import threading
 from collections.abc import Callable, Iterable
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 import grain
@@ -13,7 +14,8 @@ import numpy as np
 from essjax.data.augment import crop as crop_sequence
 from essjax.data.augment import flip, start_with_cut
 from essjax.data.layout import Dataset
-from essjax.data.read import read_segment
+from essjax.data.memory import Kept
+from essjax.data.read import read_frame, select_records
 from essjax.frames import Sequence, select_time
 
 
@@ -50,10 +52,92 @@ class CachedSource:
             return self._cache[index]
 
 
-def disk_source(dataset: Dataset, split: str, *, native: bool = False, ranges: bool = False) -> CachedSource:
-    """The segments of a split, read when first used; ``dataset.segments(split)`` says which frames are scored."""
-    read = partial(read_segment, dataset, native=native, ranges=ranges)
-    return CachedSource([partial(read, segment) for segment in dataset.segments(split)])
+class DiskSource:
+    """The segments of a split, read frame by frame when asked for; safe to share between threads.
+
+    Lengths, cuts and sizes come from the metadata. Frames stay in memory, as float32, while there is room for them.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        *,
+        native: bool = False,
+        ranges: bool = False,
+        memory: int | None = None,
+    ):
+        """See ``disk_source``."""
+        self._dataset, self._segments = dataset, dataset.segments(split)
+        self._options = {"native": native, "ranges": ranges}
+        self._records = [select_records(dataset.sequences[s.sequence], s.first, s.last) for s in self._segments]
+        self._kept = Kept(memory)
+        self._pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="essjax-read")
+
+    def __len__(self) -> int:
+        return len(self._segments)
+
+    def __getitem__(self, index: int) -> Sequence:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        return self.window(index, 0, len(self._records[index]))
+
+    def cuts(self, index: int) -> np.ndarray:
+        """Bool ``[T]``: which frames of sequence ``index`` are cuts; the first one always is."""
+        return np.array([n == 0 or bool(record.get("cut")) for n, record in enumerate(self._records[index])])
+
+    def outline(self, index: int) -> tuple[int, int, Any]:
+        """Height and width of the frames of sequence ``index``, and what it must have in common with the others."""
+        info, records = self._dataset.info, self._records[index]
+        return info.height, info.width, {record.get("camera") is None for record in records}
+
+    def window(self, index: int, start: int, length: int, box: tuple[int, int, int, int] | None = None) -> Sequence:
+        """What slicing sequence ``index`` in time, then ``crop``, gives, bit by bit; only these frames are read.
+
+        Args:
+          index: of the sequence.
+          start: its first frame that is wanted.
+          length: frames.
+          box: top, left, height and width in LR pixels, or None for whole frames.
+
+        Raises:
+          ValueError: a file is missing or damaged.
+        """
+        info = self._dataset.sequences[self._segments[index].sequence]
+
+        def read(record: Any) -> Sequence:
+            frame = self._kept.get(
+                (info.name, record["number"]),
+                lambda: read_frame(self._dataset.path, info, record, **self._options),
+            )
+            # Copied, so that a frame that is not kept is gone before the others are read.
+            return frame if box is None else jax.tree.map(np.array, crop_sequence(frame, *box))
+
+        parts = list(self._pool.map(read, self._records[index][start : start + length]))
+        found = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        return start_with_cut(found) if start == 0 else found
+
+
+def disk_source(
+    dataset: Dataset, split: str, *, native: bool = False, ranges: bool = False, memory: int | None = None
+) -> DiskSource:
+    """The segments of a split, read when first used; ``dataset.segments(split)`` says which frames are scored.
+
+    Args:
+      dataset: from ``read_dataset``.
+      split: its name.
+      native: read the native frames too, where there are any.
+      ranges: read the sample ranges too, where there are any.
+      memory: bytes of decoded frames that stay in memory, others are read again each time; None: half of what is free.
+
+    Raises:
+      ValueError: there is no such split.
+    """
+    return DiskSource(dataset, split, native=native, ranges=ranges, memory=memory)
+
+
+def _cuts(source: Source, index: int) -> np.ndarray:
+    return source.cuts(index) if isinstance(source, DiskSource) else np.asarray(source[index].frames.cut)
 
 
 def windows(source: Source, length: int) -> list[tuple[int, int]]:
@@ -62,13 +146,13 @@ def windows(source: Source, length: int) -> list[tuple[int, int]]:
     Raises:
       ValueError: there is none.
     """
-    found = []
+    found, longest = [], 0
     for index in range(len(source)):
-        cut = np.asarray(source[index].frames.cut)
+        cut = _cuts(source, index)
+        longest = max(longest, len(cut))
         starts = range(len(cut) - length + 1)
         found += [(index, start) for start in starts if not cut[start + 1 : start + length].any()]
     if not found:
-        longest = max((len(source[index].frames.cut) for index in range(len(source))), default=0)
         raise ValueError(
             f"clips: no {length} consecutive frames without a cut in {len(source)} sequences (the longest has "
             f"{longest} frames). Use a smaller length or longer sequences."
@@ -76,26 +160,42 @@ def windows(source: Source, length: int) -> list[tuple[int, int]]:
     return found
 
 
+def _outline(source: Source, index: int) -> tuple[int, int, Any]:
+    """Height and width of the frames of a sequence, and what all sequences must have in common."""
+    if isinstance(source, DiskSource):
+        return source.outline(index)
+    sequence = dataclasses.replace(source[index], native=None)
+    shape = sequence.frames.motion.shape
+    if len(shape) != 4:
+        raise ValueError(f"clips: expected sequences [T, H, W, C], got motion {shape} in sequence {index}.")
+    return shape[1], shape[2], (sequence.scale, jax.tree.structure(sequence))
+
+
 def _check_alike(source: Source, crop: tuple[int, int] | None) -> None:
     """All sequences must hold the same buffers at the same scale, and be of one size or fit the crop."""
-    bare = [dataclasses.replace(source[index], native=None) for index in range(len(source))]
-    for index, sequence in enumerate(bare):
-        shape = sequence.frames.motion.shape
-        if len(shape) != 4:
-            raise ValueError(f"clips: expected sequences [T, H, W, C], got motion {shape} in sequence {index}.")
-        height, width = shape[1:3]
+    first = _outline(source, 0)
+    for index in range(len(source)):
+        height, width, kind = _outline(source, index)
         if crop is not None and (crop[0] > height or crop[1] > width or min(crop) < 1):
             raise ValueError(
                 f"clips: a crop of {crop[1]}x{crop[0]} does not fit into sequence {index} of {width}x{height}."
             )
-        if crop is None and sequence.frames.motion.shape[1:] != bare[0].frames.motion.shape[1:]:
+        if crop is None and (height, width) != first[:2]:
             raise ValueError(f"clips: sequence {index} has another size than sequence 0. Give a crop that fits both.")
-        if sequence.scale != bare[0].scale or jax.tree.structure(sequence) != jax.tree.structure(bare[0]):
+        if kind != first[2]:
             raise ValueError(f"clips: sequence {index} has another scale or other buffers than sequence 0.")
 
 
+def _cut_out(source: Source, index: int, start: int, length: int, box: tuple[int, int, int, int] | None) -> Sequence:
+    if isinstance(source, DiskSource):
+        return dataclasses.replace(source.window(index, start, length, box), native=None)
+    clip: Sequence = select_time(dataclasses.replace(source[index], native=None), slice(start, start + length))
+    return clip if box is None else crop_sequence(clip, *box)
+
+
 def make_clip(
-    sequence: Sequence,
+    source: Source,
+    index: int,
     start: int,
     length: int,
     crop: tuple[int, int] | None,
@@ -103,13 +203,12 @@ def make_clip(
     random: np.random.Generator,
 ) -> Sequence:
     """One clip ``[length, h, w, C]``: a window in time, a random one in space, random flips; frame 0 is a cut."""
-    clip: Sequence = select_time(dataclasses.replace(sequence, native=None), slice(start, start + length))
-    height, width = clip.frames.motion.shape[-3:-1]
+    height, width, _ = _outline(source, index)
     size = crop or (height, width)
     top, left = random.integers(0, height - size[0] + 1), random.integers(0, width - size[1] + 1)
     chosen = random.random(2) < 0.5
-    if size != (height, width):
-        clip = crop_sequence(clip, int(top), int(left), *size)
+    box = None if size == (height, width) else (int(top), int(left), *size)
+    clip = _cut_out(source, index, start, length, box)
     for direction, yes in zip(("horizontal", "vertical"), chosen, strict=True):
         if flips and yes:
             clip = flip(clip, direction)
@@ -135,8 +234,9 @@ def clips(
     """Shuffled batches of clips, time-major: ``Sequence`` with NumPy leaves ``[length, batch, h, w, C]``.
 
     The order and every random choice follow from ``seed``, whatever the number of threads. ``iter(clips(...))`` has
-    ``get_state()`` and ``set_state(state)``: a resumed iterator continues exactly. All sequences are brought into
-    memory first, so that nothing is read or rendered while training waits.
+    ``get_state()`` and ``set_state(state)``: a resumed iterator continues exactly. Of a ``disk_source`` each clip
+    reads the frames that it shows, unless they are still in memory; any other source gives all its sequences first, so
+    that nothing is rendered while training waits.
 
     Args:
       source: a list of sequences, ``disk_source`` or any ``Source``.
@@ -150,7 +250,8 @@ def clips(
       prefetch: batches held ready.
 
     Raises:
-      ValueError: no window is long enough, the crop does not fit, or sequences differ in buffers or size.
+      ValueError: no window is long enough, the crop does not fit, or sequences differ in buffers or size; when a clip
+        is taken, a file that is missing or damaged.
     """
     if length < 1 or batch < 1:
         raise ValueError(f"clips: expected length >= 1 and batch >= 1, got {length} and {batch}.")
@@ -158,7 +259,7 @@ def clips(
     _check_alike(source, crop)
 
     def cut_out(window: tuple[int, int], random: np.random.Generator) -> Sequence:
-        return make_clip(source[window[0]], window[1], length, crop, flips, random)
+        return make_clip(source, *window, length, crop, flips, random)
 
     return (
         grain.MapDataset.source(found)

@@ -51,7 +51,25 @@ def _make_frame(images: Mapping[str, np.ndarray], record: Mapping, prefix: str =
     )
 
 
-def _read_frame(root: Path, info: SequenceInfo, record: Mapping, native: bool, ranges: bool) -> Sequence:
+def select_records(info: SequenceInfo, first: int, last: int) -> list[Mapping]:
+    """The records of the frames from number ``first`` to ``last``, both included."""
+    return [record for record in info.frames if first <= record["number"] <= last]
+
+
+def read_frame(root: Path, info: SequenceInfo, record: Mapping, *, native: bool, ranges: bool) -> Sequence:
+    """One frame as it lies on disk: NumPy leaves ``[H, W, C]``, float32 (``stencil`` int32, ``cut`` bool).
+
+    Args:
+      root: the dataset's folder.
+      info: of the sequence.
+      record: one of ``info.frames``.
+      native: read the native frame too, if there is one.
+      ranges: read the sample ranges too, if there are any.
+
+    Raises:
+      ValueError: names dataset, sequence, frame, file and channel, what was expected and what came.
+    """
+    native, ranges = native and info.native, ranges and info.ranges
     number, wide, high = record["number"], info.width * info.scale, info.height * info.scale
     try:
         images = _read_images(frame_path(root, info.name, "lr", number), info.channels, info.width, info.height)
@@ -107,7 +125,7 @@ def read_sequence(
         raise ValueError(f"{dataset.path}: no sequence {name!r}; there are {', '.join(dataset.sequences)}.")
     info = dataset.sequences[name]
     first, last = frames or whole(info)[1:3]
-    records = [record for record in info.frames if first <= record["number"] <= last]
+    records = select_records(info, first, last)
     if not records or first not in info.numbers or last not in info.numbers:
         raise ValueError(
             f"{dataset.path}, sequence {name}: expected a range within the frames {info.numbers[0]}.."
@@ -115,7 +133,7 @@ def read_sequence(
         )
 
     def read(record: Mapping) -> Sequence:
-        return _read_frame(dataset.path, info, record, native and info.native, ranges and info.ranges)
+        return read_frame(dataset.path, info, record, native=native, ranges=ranges)
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         parts = list(pool.map(read, records))

@@ -7,9 +7,20 @@ import jax
 import numpy as np
 import pytest
 
-from essjax.data import CachedSource, clips, disk_source, write_dataset, write_sequence
+from essjax.data import (
+    CachedSource,
+    Segment,
+    clips,
+    crop,
+    disk_source,
+    exr,
+    read_segment,
+    write_dataset,
+    write_sequence,
+)
+from essjax.data import loader as module
 from essjax.data.loader import windows
-from essjax.frames import check_shapes
+from essjax.frames import check_shapes, select_time
 from tests.helpers import make_sequence
 
 H, W, T = 8, 12, 9
@@ -117,16 +128,129 @@ def test_a_resumed_iterator_continues_exactly():
     assert_same(take(resumed, 5), expected)
 
 
-def test_disk_and_memory_are_interchangeable(tmp_path):
-    """Colours are whole numbers, which half keeps exactly."""
-    for number in range(2):
-        write_sequence(tmp_path, f"s{number}", coordinates(number))
-    source = disk_source(write_dataset(tmp_path, {"train": ["s0", "s1"]}), "train")
-    settings = {"length": 3, "batch": 2, "crop": (4, 5), "seed": 1}
-    disk = next(iter(clips(source, **settings)))
-    memory = next(iter(clips([coordinates(0), coordinates(1)], **settings)))
-    np.testing.assert_array_equal(disk.frames.color, memory.frames.color)
-    np.testing.assert_array_equal(disk.frames.motion, memory.frames.motion)
+@pytest.fixture(scope="module")
+def on_disk(tmp_path_factory):
+    """Two whole sequences, and one with a cut of which the first two frames belong to another split."""
+    root = tmp_path_factory.mktemp("clips")
+    for number in range(3):
+        full = jax.tree.map(
+            lambda leaf: np.array(leaf[:, 0]), make_sequence(number, T, 1, H, W, native=True, ranges=True)
+        )
+        cut = np.isin(np.arange(T), (0, 5) if number == 2 else (0,))
+        full = dataclasses.replace(full, frames=dataclasses.replace(full.frames, cut=cut))
+        write_sequence(root, f"s{number}", full)
+    return write_dataset(root, {"train": ["s0", "s1", Segment("s2", 2, 8, 2)], "test": [Segment("s2", 0, 1, 0)]})
+
+
+def in_memory(dataset, **options):
+    return [read_segment(dataset, segment, **options) for segment in dataset.segments("train")]
+
+
+def frame_bytes(dataset):
+    whole = dataclasses.replace(in_memory(dataset, native=False)[0], native=None)
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(whole)) // T
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Names and numbers of the frames that are read from here on."""
+    found = []
+
+    def read(root, info, record, **options):
+        found.append((info.name, record["number"]))
+        return original(root, info, record, **options)
+
+    original = module.read_frame
+    monkeypatch.setattr(module, "read_frame", read)
+    return found
+
+
+def assert_identical(a, b):
+    """Also in structure and type, and NaN and -0 are no exception."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for left, right in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes()
+
+
+@pytest.mark.parametrize("memory", [0, None])
+def test_a_window_is_a_slice_of_the_whole(on_disk, memory):
+    """The oracle is ``read_segment``, which knows nothing of windows."""
+    options = {"native": True, "ranges": True}
+    source = disk_source(on_disk, "train", memory=memory, **options)
+    for index, whole in enumerate(in_memory(on_disk, **options)):
+        assert_identical(source[index], whole)
+        np.testing.assert_array_equal(source.cuts(index), whole.frames.cut)
+        for start, length in ((0, 1), (0, 4), (2, 3), (3, 4)):
+            window = select_time(whole, slice(start, start + length))
+            assert_identical(source.window(index, start, length), window)
+            assert_identical(source.window(index, start, length, (1, 2, 5, 7)), crop(window, 1, 2, 5, 7))
+    with pytest.raises(IndexError):
+        source[3]
+
+
+@pytest.mark.parametrize("frames", [0, 7, None])
+@pytest.mark.parametrize("size", [(4, 5), None])
+def test_batches_from_disk_are_those_of_sequences_in_memory(on_disk, frames, size):
+    memory = None if frames is None else frames * frame_bytes(on_disk)
+    settings = {"length": 3, "batch": 2, "crop": size, "seed": 3}
+    expected = take(clips(in_memory(on_disk), **settings), 20)  # more than two epochs of 7 + 7 + 3 windows
+    disk = lambda: iter(clips(disk_source(on_disk, "train", memory=memory), **settings))
+    iterator = disk()
+    for batch in expected[:12]:
+        assert_identical(next(iterator), batch)
+    resumed = disk()
+    resumed.set_state(iterator.get_state())
+    for batch in expected[12:]:
+        assert_identical(next(resumed), batch)
+
+
+def test_a_clip_reads_its_own_frames_and_each_frame_once(on_disk, reads):
+    source = disk_source(on_disk, "train")
+    batches = clips(source, length=3, batch=1, epochs=1, threads=1)
+    assert windows(source, 3) == windows(in_memory(on_disk), 3) and not reads
+    source.window(1, 4, 3)
+    source.window(1, 5, 3)
+    assert sorted(reads) == [("s1", 4), ("s1", 5), ("s1", 6), ("s1", 7)]
+    assert len(list(batches)) == 7 + 7 + 3  # the third has frames 2 to 8 with a cut at 5: starts 2, 5 and 6
+    assert len(set(reads)) == len(reads) == 9 + 9 + 7
+
+
+def test_memory_is_bounded(on_disk, reads):
+    """Room for seven frames and a byte: the first seven stay, the others are read again."""
+    source = disk_source(on_disk, "train", memory=7 * frame_bytes(on_disk) + 1)
+    list(source)
+    assert source._kept.size == 7 * frame_bytes(on_disk)
+    reads.clear()
+    list(source)
+    assert len(reads) == 9 + 9 + 7 - 7
+
+
+def test_native_frames_are_not_read_for_clips(on_disk, monkeypatch):
+    opened = []
+    original = exr.read
+    monkeypatch.setattr(exr, "read", lambda path, *rest: opened.append(path.name) or original(path, *rest))
+    assert next(iter(clips(disk_source(on_disk, "train"), length=3, batch=2))).native is None
+    assert opened and {name.split(".")[0] for name in opened} == {"lr", "hr"}
+
+
+def test_a_damaged_frame_is_named_when_its_clip_is_taken(tmp_path):
+    write_sequence(tmp_path, "a", coordinates(0))
+    dataset = write_dataset(tmp_path, {"train": ["a"]})
+    (tmp_path / "a" / "hr.0004.exr").unlink()
+    batches = clips(disk_source(dataset, "train"), length=3, batch=1, epochs=1)
+    with pytest.raises(ValueError, match=r"sequence a, frame 4: .*hr\.0004\.exr: expected an EXR file, found nothing"):
+        list(batches)
+
+
+def test_sequences_with_and_without_cameras_do_not_go_together(tmp_path):
+    bare = coordinates(1)
+    write_sequence(tmp_path, "a", coordinates(0))
+    write_sequence(tmp_path, "b", dataclasses.replace(bare, frames=dataclasses.replace(bare.frames, camera=None)))
+    dataset = write_dataset(tmp_path, {"train": ["a", "b"]})
+    with pytest.raises(ValueError, match="sequence 1 has another scale or other buffers"):
+        clips(disk_source(dataset, "train"), length=2, batch=1)
+    with pytest.raises(ValueError, match="a crop of 13x4 does not fit into sequence 0 of 12x8"):
+        clips(disk_source(dataset, "train"), length=2, batch=1, crop=(4, 13))
 
 
 def test_a_cached_source_makes_each_sequence_once():
