@@ -35,7 +35,7 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
     Each metric becomes the mean over runs, with ``<metric>_range``: half of the distance between best and worst.
 
     Raises:
-      ValueError: a file of another schema, or runs that differ in more than the seed.
+      ValueError: a file of another schema, runs that differ in more than the seed, or one seed twice.
     """
     runs = [json.loads(path.read_text()) for path in paths]
     for path, run in zip(paths, runs, strict=True):
@@ -43,12 +43,16 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
             raise ValueError(f"{path}: expected schema 1, got {run.get('schema')!r}.")
         if run.get("kind") == "tables":
             return _keep_tables(name, paths, run)
-        for field in ("variant", "preset", "dataset"):
-            if run[field] != runs[0][field]:
+        first = _alike(runs[0])
+        for field, value in _alike(run).items():
+            if value != first[field]:
                 raise ValueError(
-                    f"{path}: expected the {field} of {paths[0]}, {runs[0][field]!r}, got {run[field]!r}. Give runs "
+                    f"{path}: expected the {field} of {paths[0]}, {first[field]!r}, got {value!r}. Give runs "
                     "that differ in their seed only."
                 )
+    seeds = [run["environment"]["seed"] for run in runs]
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"{name}: expected runs of different seeds, got the seeds {', '.join(map(str, seeds))}.")
     merged = {**runs[0], "rows": _merge_rows(runs)}
     if len(runs) > 1:
         environments = [run["environment"] for run in runs]
@@ -60,6 +64,14 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(merged, indent=1) + "\n")
     return path
+
+
+def _alike(run: dict[str, Any]) -> dict[str, Any]:
+    """What runs with several seeds have in common, field -> value; settings are None in files older than they."""
+    environment, configs = run["environment"], run.get("configs")
+    settings = configs and {name: {**config, "seed": None} for name, config in configs.items()}
+    parts = {field: run[field] for field in ("variant", "preset", "dataset")}
+    return {**parts, "settings": settings, "device": environment["device"], "versions": environment["versions"]}
 
 
 def _keep_tables(name: str, paths: Sequence[Path], content: dict[str, Any]) -> Path:
@@ -148,10 +160,12 @@ def _section(name: str, metrics: dict[str, Any]) -> str:
         f"seed {seeds[0]}" if len(seeds) == 1 else f"mean ± half the range over the seeds {', '.join(map(str, seeds))}"
     )
     versions = environment["versions"]
+    overrides = [text for text in metrics.get("overrides", ()) if not text.startswith("seed=")]
+    settings = f" --set {' '.join(overrides)}" if overrides else ""
     lines = [
         f"## {name}",
         "",
-        f"`--variant {metrics['variant']} --preset {metrics['preset']}`; {metrics['dataset']}.",
+        f"`--variant {metrics['variant']} --preset {metrics['preset']}{settings}`; {metrics['dataset']}.",
         f"Commit {', '.join(dict.fromkeys(commits))}; {environment['device']}; jax {versions['jax']}, Python "
         f"{versions['python']}; {seed}; steps: {steps}.",
         "Seconds: " + ", ".join(f"{part} {value:g}" for part, value in metrics["seconds"].items()) + ".",

@@ -17,7 +17,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         description="Train several variants on the same frames, evaluate all side by side, write one report.",
     )
     parser.add_argument("--variants", default="", metavar="A,B,C", help="names, separated by commas; --list shows all")
-    parser.add_argument("--out", metavar="DIR", help="where results go (default: runs/compare-PRESET)")
+    parser.add_argument("--out", metavar="DIR", help="where results go (default: runs/compare-PRESET[-DATA])")
     shared_options(parser)
     return parser.parse_args(arguments)
 
@@ -30,12 +30,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _compare(options: argparse.Namespace, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
+    from experiments.experiment import default_folder
+
     if options.list:
         return print_variants(console)
     names = list(dict.fromkeys(name.strip() for name in options.variants.split(",") if name.strip()))
     if not names:
         raise ValueError("--variants: expected names separated by commas, got none. --list shows all.")
-    out = Path(options.out or f"runs/compare-{options.preset}")
+    out = Path(options.out) if options.out else default_folder("compare", options.preset, options.data)
     compare(
         names, preset=options.preset, overrides=options.overrides, data=options.data, out=out, resume=options.resume,
         eval_only=options.eval_only, console=console,
@@ -62,16 +64,17 @@ def compare(
     Raises:
       ValueError: an unknown variant, preset or key, or ``out`` holds another run.
     """
-    from experiments.experiment import claim, run_experiment
+    from experiments.experiment import check_folder, run_experiment
     from experiments.variants import config_of, trained_as
 
     configs = {name: config_of(name, preset, overrides) for name in names}
     folders = {name: out / "variants" / trained_as(name) for name in names}
     wanted = {"variants": names, "data": data, **{name: dataclasses.asdict(c) for name, c in configs.items()}}
-    claim(out, wanted, resume=resume, eval_only=eval_only)
+    check_folder(out, wanted, resume=resume, eval_only=eval_only)
     return run_experiment(
-        names, configs, folders, preset=preset, data=data, out=out, eval_only=eval_only, console=console
-    )
+        names, configs, folders, preset=preset, overrides=overrides, data=data, out=out, wanted=wanted,
+        eval_only=eval_only, console=console,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

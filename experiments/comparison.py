@@ -1,13 +1,13 @@
 """The rows of a run's table: which methods, with which variables, and what to tell the reader about them."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 
-from essjax.data import Dataset
+from essjax.data import Dataset, Segment
+from essjax.data.layout import read_json, write_json
 from essjax.frames import Sequence as FrameSequence
 from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method, MethodInfo
@@ -30,6 +30,33 @@ class Trained(NamedTuple):
     variables: PyTree
     config: Config
     report: dict[str, Any]
+
+
+def check_scored(dataset: Dataset, config: Config) -> None:
+    """Refuse data with sequences of which no frame is scored, before anything is trained.
+
+    Raises:
+      ValueError: a test sequence, or a validation sequence where methods are tuned on them, is all warm-up.
+    """
+    for split in ("validation", "test") if config.tune else ("test",):
+        empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, config)]
+        if empty:
+            raise ValueError(
+                f"{dataset.path}, split {split}: expected frames to score in every sequence, got none in "
+                f"{', '.join(empty)}: all are among the {config.warmup} that warm up at the start and after a cut. "
+                "Give longer sequences, or fewer frames to warm up with --set warmup=N."
+            )
+
+
+def _has_scored(dataset: Dataset, segment: Segment, config: Config) -> bool:
+    """What ``load_clip`` will find, without reading an image."""
+    cuts = {record["number"]: record["cut"] for record in dataset.sequences[segment.sequence].frames}
+    since_cut = -1
+    for number, counts in zip(dataset.numbers(segment), dataset.scored(segment), strict=True):
+        since_cut = 0 if cuts[number] else since_cut + 1
+        if counts and since_cut >= config.warmup:
+            return True
+    return False
 
 
 def make_runners(
@@ -78,7 +105,7 @@ def make_runners(
         else:
             runners[row] = Runner(method, method.init(jax.random.key(0), frames), config.compiler_options)
     content = {row: setting._asdict() for row, setting in settings.items()}
-    (out / "tuning.json").write_text(json.dumps(content, indent=1) + "\n")
+    write_json(out / "tuning.json", content)
     return runners, settings
 
 
@@ -103,7 +130,7 @@ def unfit(method: Method, sequence: FrameSequence) -> str:
 def _read_settings(path: Path) -> dict[str, Setting]:
     if not path.exists():
         return {}
-    return {row: Setting(**setting) for row, setting in json.loads(path.read_text()).items()}
+    return {row: Setting(**setting) for row, setting in read_json(path).items()}
 
 
 def table_references(runners: Mapping[str, Runner], scale: int) -> dict[str, str]:

@@ -14,11 +14,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from essjax.data import Dataset
+from essjax.data.layout import read_json
 from essjax.deploy import method_cost
 from experiments import datasets
 from experiments import environment as machine
 from experiments.classes import QUESTIONS, class_remark, evaluate_classes
-from experiments.comparison import Trained, make_runners, notes, table_references
+from experiments.comparison import Trained, check_scored, make_runners, notes, table_references
 from experiments.config import Config
 from experiments.evaluate import Clip, Runner, evaluate, load_clip
 from experiments.report import print_table, write_report
@@ -28,15 +29,25 @@ from experiments.variants import VARIANTS, stages_of, trained_as
 from experiments.variants.classifier import thresholds
 
 
-def claim(out: Path, wanted: Mapping[str, Any], *, resume: bool, eval_only: bool) -> None:
-    """Record in ``out / "run.json"`` what runs there; refuse to mix two runs or to start over one that can be resumed.
+def default_folder(name: str, preset: str, data: str | None) -> Path:
+    """Where a run goes without ``--out``: ``runs/NAME-PRESET``, with ``--data`` ``runs/NAME-PRESET-`` and its name."""
+    return Path("runs") / "-".join([name, preset, *([Path(data).resolve().name] if data else [])])
+
+
+def check_folder(out: Path, wanted: Mapping[str, Any], *, resume: bool, eval_only: bool) -> None:
+    """Refuse to mix two runs in ``out`` or to start over one that can be resumed; ``out / "run.json"`` says what it is.
+
+    Nothing is written: a run that finds no data leaves nothing that stands in the way of the next.
 
     Raises:
-      ValueError: ``out`` holds another run, or one that was not asked to continue.
+      ValueError: ``out`` is no folder, holds another run, or one that was not asked to continue.
     """
     path, wanted = out / "run.json", json.loads(json.dumps(wanted))
+    file = next((folder for folder in (out, *out.parents) if folder.exists() and not folder.is_dir()), None)
+    if file:
+        raise ValueError(f"--out {out}: expected a folder, but {file} is a file. Choose another --out.")
     if path.exists():
-        found = json.loads(path.read_text())
+        found = read_json(path)
         if not (resume or eval_only):
             raise ValueError(
                 f"{out} already holds a run. Continue it with --resume, evaluate it with --eval-only, "
@@ -48,8 +59,6 @@ def claim(out: Path, wanted: Mapping[str, Any], *, resume: bool, eval_only: bool
             raise ValueError(f"{out} holds a run with other settings: {pairs}. Use the same ones, or another --out.")
     elif eval_only:
         raise ValueError(f"--eval-only: {out} holds no run. Give the --out of a trained one.")
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(path, wanted)
 
 
 def run_experiment(
@@ -58,8 +67,10 @@ def run_experiment(
     folders: Mapping[str, Path],
     *,
     preset: str,
+    overrides: Sequence[str],
     data: str | None,
     out: Path,
+    wanted: Mapping[str, Any],
     eval_only: bool,
     console: Console,
 ) -> dict[str, Any]:
@@ -70,13 +81,18 @@ def run_experiment(
       configs: variant -> its settings; all agree in everything but training.
       folders: variant -> where its checkpoints and logs lie.
       preset: name of the preset, for the record.
+      overrides: of the command line on top of it, for the record.
       data: a dataset's folder, or None to render the built-in scenes into ``out``.
       out: folder of the results.
+      wanted: what ``check_folder`` found to fit; kept in ``out / "run.json"`` as soon as there is data.
       eval_only: do not train, restore.
       console: where progress and tables are printed.
 
     Returns:
       The content of ``metrics.json``.
+
+    Raises:
+      ValueError: data that does not fit, or of which no frame would be scored.
     """
     config, clock, seconds = configs[names[0]], time.monotonic(), {}
 
@@ -100,10 +116,15 @@ def run_experiment(
         config = configs[names[0]]
         progress.update(bar, completed=1, total=1, text=f"{len(dataset.sequences)} sequences")
         console.print(datasets.describe(dataset), soft_wrap=True)
+        check_scored(dataset, config)
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / "run.json", wanted)
         lap("data")
 
         trained = _train_all(names, configs, folders, dataset, eval_only, progress)
         lap("training")
+        # Of all sessions: the clock above saw only this one, which may have restored everything.
+        seconds["training"] = round(sum(stage["seconds"] for t in trained.values() for stage in t.report.values()), 1)
 
         bar = progress.add_task("evaluate", total=None, text="reading")
         segments = {split: dataset.segments(split) for split in ("validation", "test")}
@@ -129,6 +150,8 @@ def run_experiment(
         "schema": 1,
         "variant": ", ".join(names),
         "preset": preset,
+        "overrides": list(overrides),
+        "configs": {name: dataclasses.asdict(each) for name, each in configs.items()},
         "dataset": datasets.describe(dataset),
         "environment": environment(config, {name: found.report for name, found in trained.items()}),
         "settings": {name: setting._asdict() for name, setting in settings.items()},
@@ -149,16 +172,16 @@ def run_experiment(
     write_json(out / "metrics.json", metrics)
     print_table(metrics, references=references, console=console)
     for remark in remarks:
-        console.print(f"[dim]{remark}[/dim]", soft_wrap=True)
+        console.print(remark, style="dim", markup=False, soft_wrap=True)
     spent = ", ".join(f"{name} {value:.0f} s" for name, value in metrics["seconds"].items())
-    console.print(f"{spent}\nmetrics: {out / 'metrics.json'}\nreport:  {page}", soft_wrap=True)
+    console.print(f"{spent}\nmetrics: {out / 'metrics.json'}\nreport:  {page}", markup=False, soft_wrap=True)
     return metrics
 
 
 _COLUMNS = (
     TextColumn("{task.description:<16}"),
     BarColumn(),
-    TextColumn("{task.fields[text]}"),
+    TextColumn("{task.fields[text]}", markup=False),  # names of sequences may have brackets
     TimeElapsedColumn(),
 )
 

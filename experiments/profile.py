@@ -60,10 +60,11 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
                     state, terms = step(state, batch, stage.learning_rate)
                     jax.block_until_ready(terms)
     for line in describe(operations(folder)):
-        console.print(line, soft_wrap=True, highlight=False)
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
     console.print(
         f"trace: {folder}\nOpen it with `pip install xprof && xprof --logdir {folder}`, or load its *.trace.json.gz in "
         "Perfetto.",
         soft_wrap=True,
+        markup=False,
     )
     return 0

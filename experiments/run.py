@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
+from rich.text import Text
 
 from experiments.config import PRESET_NAMES
 
@@ -27,7 +28,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "python -m experiments.run", description="Train a variant, evaluate it against baselines, write a report."
     )
     parser.add_argument("--variant", default="extrass", help="what to run; --list shows all (default: extrass)")
-    parser.add_argument("--out", metavar="DIR", help="where results go (default: runs/VARIANT-PRESET)")
+    parser.add_argument("--out", metavar="DIR", help="where results go (default: runs/VARIANT-PRESET[-DATA])")
     parser.add_argument(
         "--profile", action="store_true", help="write a JAX profiler trace of train and streaming steps"
     )
@@ -46,14 +47,20 @@ def guarded(command: Callable[[Console], int]) -> int:
     console = Console()
     try:
         return command(console)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         from essjax.train import Interrupted
 
-        console.print(f"[red]{'Stopped' if isinstance(error, Interrupted) else 'Error'}:[/red] {error}", soft_wrap=True)
-        return 130 if isinstance(error, Interrupted) else 2
+        stopped = isinstance(error, Interrupted)
+        print_error(error, console, "Stopped" if stopped else "Error")
+        return 130 if stopped else 2
     except KeyboardInterrupt:
         console.print("[red]Stopped.[/red] Run the same command with --resume to continue.")
         return 130
+
+
+def print_error(error: Exception, console: Console, label: str = "Error") -> None:
+    """One line; brackets in the message are no markup."""
+    console.print(Text.assemble((f"{label}:", "red"), f" {error}"), soft_wrap=True)
 
 
 def print_variants(console: Console) -> int:
@@ -69,7 +76,7 @@ def print_variants(console: Console) -> int:
 
 def _run(options: argparse.Namespace, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
-    from experiments.experiment import claim, run_experiment
+    from experiments.experiment import check_folder, default_folder, run_experiment
     from experiments.profile import write_profile
     from experiments.variants import config_of
 
@@ -77,14 +84,14 @@ def _run(options: argparse.Namespace, console: Console) -> int:
         return print_variants(console)
     name = options.variant
     config = config_of(name, options.preset, options.overrides)
-    out = Path(options.out or f"runs/{name}-{options.preset}")
+    out = Path(options.out) if options.out else default_folder(name, options.preset, options.data)
     if options.profile:
         return write_profile(name, config, out, console)
     wanted = {"variant": name, "data": options.data, **dataclasses.asdict(config)}
-    claim(out, wanted, resume=options.resume, eval_only=options.eval_only)
+    check_folder(out, wanted, resume=options.resume, eval_only=options.eval_only)
     run_experiment(
-        [name], {name: config}, {name: out}, preset=options.preset, data=options.data, out=out,
-        eval_only=options.eval_only, console=console,
+        [name], {name: config}, {name: out}, preset=options.preset, overrides=options.overrides, data=options.data,
+        out=out, wanted=wanted, eval_only=options.eval_only, console=console,
     )  # fmt: skip
     return 0
 

@@ -105,22 +105,30 @@ def train_stages(
 
 
 def restore_stages(stages: list[Stage], dataset: Dataset, config: Config, out: Path) -> tuple[PyTree, dict[str, Any]]:
-    """The variables of the newest checkpoint of the last stage, for ``--eval-only``.
+    """The variables of the stages' newest checkpoints, for ``--eval-only``, and how they were trained.
+
+    Returns:
+      The variables, and stage -> ``{"steps", "seconds", "terms"}`` as ``train_stages`` gave them, without terms.
 
     Raises:
-      ValueError: there is none, or it does not fit the settings.
+      ValueError: a stage has no checkpoint, or one that does not fit the settings.
     """
-    last = stages[-1]
-    variables = initial_variables(stages, dataset, config)
-    folder = out / "checkpoints" / last.name
-    if not folder.is_dir() or not os.listdir(folder):
-        raise ValueError(f"--eval-only: {folder} holds no checkpoint. Train first, or give the --out of a trained run.")
-    checkpoints = Checkpoints(folder)
-    try:
-        state, saved = checkpoints.restore(create_state(variables, last.name, optimizer()))
-    finally:
-        checkpoints.close()
-    return state.variables, {last.name: {"steps": int(state.step), "seconds": saved["seconds"], "terms": {}}}
+    variables, report = initial_variables(stages, dataset, config), {}
+    for stage in stages:
+        folder = out / "checkpoints" / stage.name
+        if not folder.is_dir() or not os.listdir(folder):
+            raise ValueError(
+                f"--eval-only: {folder} holds no checkpoint. Train first, or give the --out of a trained run."
+            )
+        needed = {name: variables[name] for name in _entries(stages, stage)}
+        checkpoints = Checkpoints(folder)
+        try:
+            state, saved = checkpoints.restore(create_state(needed, stage.name, optimizer()))
+        finally:
+            checkpoints.close()
+        variables = {**variables, **state.variables}
+        report[stage.name] = {"steps": int(state.step), "seconds": saved["seconds"], "terms": {}}
+    return variables, report
 
 
 def _entries(stages: list[Stage], stage: Stage) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from experiments.benchmark.schema import SIZE
+from experiments.run import print_error
 
 SUITES = ("warp", "networks", "pipeline", "train", "scenes")
 
@@ -39,8 +40,8 @@ def main(arguments: list[str] | None = None) -> int:
     options, console = parse(arguments), Console()
     try:
         return _benchmark(options, console)
-    except (ValueError, RuntimeError) as error:
-        console.print(f"[red]Error:[/red] {error}", soft_wrap=True)
+    except (ValueError, RuntimeError, OSError) as error:
+        print_error(error, console)
         return 2
 
 
@@ -112,7 +113,7 @@ def _benchmark(options: argparse.Namespace, console: Console) -> int:
         partial.unlink()
         for fact, value in result["facts"].items():
             console.print(f"{fact}: {value:.3g}", soft_wrap=True)
-        console.print(f"{name}: {path}", soft_wrap=True)
+        console.print(f"{name}: {path}", soft_wrap=True, markup=False)
     return 0
 
 

@@ -168,7 +168,8 @@ def _round(value: Any) -> Any:
 def _facts(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What made these numbers: preset, environment, times."""
     environment = dict(metrics.get("environment") or {})
-    facts = [("preset", str(metrics.get("preset", "–")))]
+    overrides = " ".join(metrics.get("overrides") or ())
+    facts = [("preset", f"{metrics.get('preset', '–')} {overrides}".rstrip())]
     for name, value in environment.items():
         if isinstance(value, Mapping):
             value = ", ".join(f"{key} {item}" for key, item in value.items())
@@ -183,16 +184,18 @@ def _fact(name: str, value: str) -> str:
 
 
 def _table(table: Table) -> str:
-    groups = "".join(f'<th colspan="{len(COLUMNS)}" scope="colgroup">{KIND_NAMES[kind]}</th>' for kind in table.kinds)
+    groups = "".join(
+        f'<th colspan="{len(table.columns)}" scope="colgroup">{KIND_NAMES[kind]}</th>' for kind in table.kinds
+    )
     labels = "".join(
         f'<th scope="col" title="{html.escape(column.help)}"{_edge(k)}>{column.label}</th>'
         for _ in table.kinds
-        for k, column in enumerate(COLUMNS)
+        for k, column in enumerate(table.columns)
     )
     body = []
     for line in table.lines:
         cells = [
-            f"<td{_edge(k % len(COLUMNS))}>{'<b>' + cell.text + '</b>' if cell.best else cell.text}</td>"
+            f"<td{_edge(k % len(table.columns))}>{'<b>' + cell.text + '</b>' if cell.best else cell.text}</td>"
             for k, cell in enumerate(line.cells)
         ]
         remark = f"<small>{html.escape(line.remark)}</small>" if line.remark else ""

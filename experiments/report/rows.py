@@ -47,7 +47,7 @@ class Cell(NamedTuple):
 
 
 class Line(NamedTuple):
-    """One method's line: cells by kinds, then ``COLUMNS``; ``remark`` where it is not comparable or not finite."""
+    """One method's line: cells by kinds, then columns; ``remark`` where it is not comparable or not finite."""
 
     method: str
     cells: list[Cell]
@@ -55,11 +55,15 @@ class Line(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What one resolution and one sequence (or "mean") scored; the title says against what."""
+    """What one resolution and one sequence (or "mean") scored; the title says against what.
+
+    Each kind of frame has the same columns, those that say something.
+    """
 
     title: str
     sequence: str
     kinds: list[str]
+    columns: tuple[Column, ...]
     lines: list[Line]
 
 
@@ -118,7 +122,11 @@ def make_table(
     kinds = [kind for kind in ("ss", "ess") if kind in present] or sorted(present)
     methods = dict.fromkeys(method for method, _ in rows)
     methods = sorted(methods, key=lambda method: (method in references, -_quality(rows, method, kinds)))
-    columns = [(kind, column) for kind in kinds for column in COLUMNS]
+    # Low-resolution extrapolation shows each rendered frame as it is: the frame before is the target itself, and the
+    # error of the difference to it that of the frame.
+    repeated = {"tpsnr"} if resolution == "lr" and kinds == ["ess"] else set()
+    shown = tuple(column for column in COLUMNS if column.key not in repeated)
+    columns = [(kind, column) for kind in kinds for column in shown]
     values = {(m, k, c.key): shown_value(rows.get((m, k)), c) for m in methods for k, c in columns}
     comparable = [method for method in methods if method not in references]
     best = {(k, c.key): _best([values[m, k, c.key] for m in comparable], c.best) for k, c in columns}
@@ -134,7 +142,7 @@ def make_table(
         lines.append(Line(method, cells, "; ".join(filter(None, (references.get(method), lost)))))
     shares = [row["hole_share"] for row in rows.values() if row.get("hole_share") is not None]
     holes = f" (holes: {100 * sum(shares) / len(shares):.1f} % of the pixels)" if shares else ""
-    return Table(RESOLUTION_NAMES[resolution] + holes, sequence, kinds, lines)
+    return Table(RESOLUTION_NAMES[resolution] + holes, sequence, kinds, shown, lines)
 
 
 def _quality(rows: Mapping[tuple[str, str], Mapping[str, Any]], method: str, kinds: list[str]) -> float:

@@ -13,7 +13,7 @@ def run(folder, psnr, **changes):
     """A ``metrics.json`` with one row, of the given PSNR."""
     row = {"method": "jau", "frames": "ss", "resolution": "hr", "psnr": psnr, "ssim": 0.71239, "tpsnr": None}
     environment = {"commit": "abc", "device": "cpu", "seed": changes.pop("seed", 0), "steps": {"a": 3}}
-    environment["versions"] = {"jax": "1", "python": "3"}
+    environment |= {"device": changes.pop("device", "cpu"), "versions": {"jax": changes.pop("jax", "1"), "python": "3"}}
     metrics = {
         "schema": 1, "variant": "extrass", "preset": "quick", "dataset": "d", "environment": environment,
         "seconds": {"data": 2.0}, "rows": [{**row, "sequence": "mean"}, {**row, "sequence": "one"}], **changes,
@@ -43,6 +43,35 @@ def test_runs_with_several_seeds_become_mean_and_range(tmp_path, monkeypatch):
     assert "seeds 0, 1, 2; steps: a 3; a 3; a 3." in text and "Commit abc;" in text
     with pytest.raises(ValueError, match="expected the dataset of .* 'd', got 'other'"):
         benchmarks_page.keep("mixed", [paths[0], run(tmp_path / "other", 1.0, dataset="other")])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, "expected runs of different seeds, got the seeds 0, 0"),
+        ({"seed": 1, "device": "H100"}, "expected the device of .*, 'cpu', got 'H100'"),
+        ({"seed": 1, "jax": "2"}, "expected the versions of .*, {'jax': '1', .*, got {'jax': '2'"),
+        ({"seed": 1, "configs": {"extrass": {"width": 24, "seed": 1}}}, "expected the settings of .*'width': 16"),
+    ],
+)
+def test_runs_that_differ_in_more_than_the_seed_are_not_merged(tmp_path, monkeypatch, changes, message):
+    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
+    configs = {"extrass": {"width": 16, "seed": 0}}
+    paths = [run(tmp_path / "a", 23.0, configs=configs), run(tmp_path / "b", 24.0, **{"configs": configs, **changes})]
+    with pytest.raises(ValueError, match=message):
+        benchmarks_page.keep("mixed", paths)
+    assert not (tmp_path / "mixed.json").exists()
+
+
+def test_settings_stand_beside_the_preset_but_for_the_seed(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
+    paths = [
+        run(tmp_path / str(seed), 23.0, seed=seed, overrides=[f"seed={seed}", "width=24"],
+            configs={"extrass": {"width": 24, "seed": seed}})
+        for seed in (0, 1)
+    ]  # fmt: skip
+    benchmarks_page.keep("two", paths)
+    assert "`--variant extrass --preset quick --set width=24`; d." in benchmarks_page.current()
 
 
 def test_tables_are_kept_as_they_are(tmp_path, monkeypatch):

@@ -34,6 +34,7 @@ def make_metrics():
     rows += [{**row(m, "ess", v), "resolution": "lr"} for m, v in (("warp", 23.0), ("extrass-w", 25.0))]
     return {
         "schema": 1, "variant": "extrass", "preset": "quick", "dataset": "built-in scenes", "rows": rows,
+        "overrides": ["width=24", "seed=3"],
         "environment": {"commit": "0123456789abcdef", "device": "cpu", "versions": {"jax": "0.10.2"}, "seed": 3},
         "seconds": {"train": 61.4},
         "costs": {"extrass": {"parameters": 262141, "multiply_adds": {"ss": 1_500_000_000, "ess": 2_000_000_000},
@@ -112,7 +113,8 @@ def test_page_is_well_formed_and_self_contained(report):
     for method in (*METHODS, "warp", "extrass-w"):
         assert method in checker.cells
     assert "29.00 ±0.10" in checker.cells and "renders every frame: twice the input" in checker.cells
-    for expected in ("0123456789ab", "jax 0.10.2", "61 s", "extrass: 29.00 dB on rendered frames"):
+    facts = ("0123456789ab", "jax 0.10.2", "61 s", "quick width=24 seed=3")
+    for expected in (*facts, "extrass: 29.00 dB on rendered frames"):
         assert expected in text
     assert "no taa row &lt;/script&gt; {{data}}." in text  # notes are escaped and not taken for marks
     assert "<grilles>" not in text
@@ -199,6 +201,17 @@ def test_table_order_best_and_references():
     assert cells["extrass"]["ss", "warped_error"] == ("-1.00", True)  # nearest to the reference
     without = make_table(make_metrics(), "hr", "mean")
     assert without.lines[0].method == "taau" or without.lines[0].cells[0].text != "31.00"
+
+
+def test_flicker_that_only_repeats_the_error_has_no_column():
+    """LR extrapolation beside rendered frames that are shown as they are; other tables keep the column."""
+    metrics = make_metrics()
+    table = make_table(metrics, "lr", "mean")
+    assert table.kinds == ["ess"] and [c.key for c in table.columns] == ["psnr", "ssim", "psnr_holes", "warped_error"]
+    assert [cell.text for cell in table.lines[0].cells] == ["25.00", "0.6250", "19.00", "–"]
+    assert make_table(metrics, "hr", "mean").columns == COLUMNS
+    metrics["rows"].append({**row("upscaler", "ss", 24.0), "resolution": "lr"})  # rendered frames have errors too
+    assert make_table(metrics, "lr", "mean").columns == COLUMNS
 
 
 def test_frames_that_are_not_finite_stand_in_the_remark():

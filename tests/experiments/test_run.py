@@ -24,11 +24,13 @@ def finished(tmp_path_factory):
 
 
 def test_metrics_json(finished):
-    out, code, _ = finished
+    out, code, overrides = finished
     assert code == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["schema"] == 1 and metrics["variant"] == "extrass" and metrics["preset"] == "smoke"
     assert metrics["environment"]["steps"] == {"frnet": 2, "extrassnet": 2}
+    assert metrics["overrides"] == overrides
+    assert metrics["configs"]["extrass"]["size"] == [32, 24] and metrics["configs"]["extrass"]["width"] == 8
     assert {"commit", "device", "versions", "seed"} <= set(metrics["environment"])
     assert set(metrics["seconds"]) == {"data", "training", "tuning", "evaluation", "report", "total"}
     means = {(r["method"], r["frames"], r["resolution"]): r for r in metrics["rows"] if r["sequence"] == "mean"}
@@ -62,9 +64,12 @@ def test_a_finished_folder_is_not_overwritten(finished, capsys):
 
 def test_eval_only_gives_the_same_numbers(finished):
     out, _, overrides = finished
-    before = json.loads((out / "metrics.json").read_text())["rows"]
+    before = json.loads((out / "metrics.json").read_text())
     assert run.main(["--preset", "smoke", "--out", str(out), "--eval-only", "--set", *overrides]) == 0
-    assert json.loads((out / "metrics.json").read_text())["rows"] == before
+    after = json.loads((out / "metrics.json").read_text())
+    assert after["rows"] == before["rows"] and after["configs"] == before["configs"]
+    assert after["environment"]["steps"] == before["environment"]["steps"]
+    assert after["seconds"]["training"] == before["seconds"]["training"]  # of the training, not of reading it
 
 
 @pytest.mark.parametrize(
