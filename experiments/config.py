@@ -154,11 +154,8 @@ def _check(config: Config) -> None:
             raise ValueError(f"--set {name}: expected a number above 0, got {value}.")
     if not math.isfinite(config.mip_bias):
         raise ValueError(f"--set mip_bias: expected a finite number, got {config.mip_bias}.")
-    if config.jitter not in JITTERS:
-        raise ValueError(f"--set jitter: expected one of {', '.join(JITTERS)}, got {config.jitter!r}.")
 
 
-JITTERS = ("halton", "dlctus")
 _LEAST = {
     "seed": (0, ""), "scale": (1, ""), "train_sequences": (1, ""), "validation_sequences": (1, ""),
     "test_sequences": (1, ""), "train_frames": (2, " frames"), "test_frames": (2, " frames"),

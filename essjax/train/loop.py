@@ -23,15 +23,18 @@ class NonFiniteLoss(RuntimeError):
 
 
 class Budget(NamedTuple):
-    """When a stage ends: after ``steps``, or after ``seconds`` of training in all runs together; None = no limit."""
+    """When a stage ends: after ``steps``, or after ``seconds`` of training in all runs together; None = no limit.
+
+    A limit of 0 is used up before the first step.
+    """
 
     steps: int | None
     seconds: float | None
 
     def progress(self, step: int, seconds: float) -> float:
         """Fraction that is used up, in [0, 1]. With a limit in steps alone it does not depend on the machine."""
-        used = [step / self.steps] if self.steps else []
-        used += [seconds / self.seconds] if self.seconds else []
+        limits = ((step, self.steps), (seconds, self.seconds))
+        used = [spent / limit if limit > 0 else 1.0 for spent, limit in limits if limit is not None]
         if not used:
             raise ValueError("budget: expected a limit in steps or in seconds, got neither.")
         return min(max(used), 1.0)

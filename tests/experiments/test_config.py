@@ -1,6 +1,8 @@
+import dataclasses
+
 import pytest
 
-from experiments.config import PRESETS, make_config
+from experiments.config import _LEAST, _POSITIVE, PRESETS, Config, make_config
 from experiments.variants import VARIANTS, compared, config_of, get_variant, stages_of
 
 
@@ -20,12 +22,30 @@ def test_overrides_are_typed():
         ("quick", ["width=wide"], "width=wide: expected int"),
         ("quick", ["size=[96]"], r"size=\[96\]: expected \[width,height\]"),
         ("quick", ["seconds=null"], "steps and seconds are both null"),
-        ("quick", ["test_frames=1"], "at least 2 frames, got 1"),
+        ("quick", ["test_frames=1"], "--set test_frames: expected at least 2 frames, got 1"),
+        ("quick", ["width=0"], "--set width: expected at least 1 channel, got 0"),
+        ("quick", ["seed=-1"], "--set seed: expected at least 0, got -1"),
+        ("quick", ["scale=0"], "--set scale: expected at least 1, got 0"),
+        ("quick", ["warmup=-3"], "--set warmup: expected at least 0 frames, got -3"),
+        ("quick", ["test_spp=0"], "--set test_spp: expected at least 1 sample, got 0"),
+        ("quick", ["steps=-1", "seconds=null"], "--set steps: expected at least 1 step, got -1"),
+        ("quick", ["first_steps=0"], "--set first_steps: expected at least 1 step, got 0"),
+        ("quick", ["seconds=0"], "--set seconds: expected a number above 0, got 0"),
+        ("quick", ["first_seconds=Infinity"], "--set first_seconds: expected a number above 0, got inf"),
+        ("quick", ["learning_rate=NaN"], "--set learning_rate: expected a number above 0, got nan"),
+        ("quick", ["vgg_weight=NaN"], "--set vgg_weight: expected at least 0, got nan"),
+        ("quick", ["mip_bias=-Infinity"], "--set mip_bias: expected a finite number, got -inf"),
     ],
 )
 def test_bad_settings_say_what_is_valid(preset, overrides, message):
     with pytest.raises(ValueError, match=message):
         make_config(preset, overrides)
+
+
+def test_every_number_has_a_bound():
+    kinds = (int, float, int | None, float | None)
+    numbers = {field.name for field in dataclasses.fields(Config) if field.type in kinds}
+    assert numbers - {"mip_bias"} == set(_LEAST) | set(_POSITIVE)
 
 
 def test_every_preset_passes_its_own_check():

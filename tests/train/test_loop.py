@@ -159,5 +159,7 @@ def test_budget():
     assert Budget(10, 20.0).progress(4, 18.0) == 0.9  # whichever ends first
     assert Budget(10, 20.0).progress(8, 1.0) == 0.8
     assert Budget(10, 20.0).progress(30, 1.0) == 1.0
+    for nothing in (Budget(0, None), Budget(None, 0.0), Budget(-1, 20.0)):
+        assert nothing.progress(0, 0.0) == 1.0
     with pytest.raises(ValueError, match="budget: expected a limit in steps or in seconds, got neither"):
         Budget(None, None).progress(1, 1.0)
