@@ -210,15 +210,17 @@ def classifier(
 
     def start(example: Frame) -> History:
         *lead, height, low_width, _ = example.motion.shape
-        plane = jnp.zeros((*lead, scale * height, scale * low_width, 1), jnp.float32)
-        color = jnp.repeat(plane, 3, axis=-1)
+
+        def zeros(channels: int) -> Array:  # new each time: a streaming step donates every array of the history
+            return jnp.zeros((*lead, scale * height, scale * low_width, channels), jnp.float32)
+
         return History(
-            image=color,
-            counter=plane,
-            low=color,
-            high=color,
-            closeness=plane,
-            logits=jnp.repeat(plane, 6, axis=-1),
+            image=zeros(3),
+            counter=zeros(1),
+            low=zeros(3),
+            high=zeros(3),
+            closeness=zeros(1),
+            logits=zeros(6),
             depth_scale=depth_scale(example.gbuffers),
             empty=jnp.ones(example.cut.shape, bool),
         )
