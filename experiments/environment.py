@@ -12,14 +12,23 @@ import jax
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
 
 
+def commit(root: Path) -> str:
+    """Of the clone ``root``; "unknown" where it is none, also inside another repository (in a virtual environment)."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root.resolve():
+            return "unknown"
+        return git("describe", "--always", "--dirty", "--abbrev=12")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
 def environment(*packages: str) -> dict[str, Any]:
     """Commit ("unknown" outside a clone), device and versions; those of ``packages`` too where they are installed."""
-    root = Path(__file__).resolve().parent.parent
-    try:
-        git = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-        commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
     versions = {"python": platform.python_version()}
     for name in (*PACKAGES, *packages):
         try:
@@ -27,7 +36,7 @@ def environment(*packages: str) -> dict[str, Any]:
         except PackageNotFoundError:
             continue
     return {
-        "commit": commit,
+        "commit": commit(Path(__file__).resolve().parent.parent),
         "device": f"{jax.devices()[0].device_kind} ({jax.default_backend()}), {os.cpu_count()} CPU cores",
         "versions": versions,
     }
