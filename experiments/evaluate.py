@@ -236,7 +236,7 @@ def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
     rendered = rendered_color(frames, "the report")
     target = rendered if low else clip.sequence.reference
     # What was rendered last: this frame, or the one before where this one is extrapolated.
-    inputs = {"images": n if kind == SS else n - 1, "previous": n - 1 if kind == SS else n - 1}
+    inputs = {"images": n if kind == SS else n - 1, "previous": n - 2 if kind == SS else n - 1}
     picture: dict[str, Any] = {
         "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
     }  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from essjax.methods.interpolation import interpolator
-from experiments.evaluate import Clip, Runner, evaluate, has_image, schedules, score_clip
+from experiments.evaluate import Clip, Runner, _new_picture, evaluate, has_image, schedules, score_clip
 from tests.helpers import make_sequence
 
 T, H, W = 9, 12, 16
@@ -50,6 +50,16 @@ def test_images_stand_at_their_frames_and_others_are_not_scored(clip):
 def _shown(color):
     linear = color / (1 + color)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize(("kind", "now", "before"), [("ss", 4, 2), ("ess", 3, 3)])
+def test_the_input_shows_what_was_rendered_last(clip, kind, now, before):
+    """Every other frame is rendered: before a rendered frame that is the one before the last."""
+    color, picture = np.asarray(clip.sequence.frames.color), _new_picture(clip, 4, kind, low=True)
+    np.testing.assert_array_equal(picture["images"]["input"], color[now])
+    np.testing.assert_array_equal(picture["previous"]["input"], color[before])
+    np.testing.assert_array_equal(picture["images"]["reference"], color[4])
+    np.testing.assert_array_equal(picture["previous"]["reference"], color[3])
 
 
 def test_pictures_show_no_repeated_frame(clip):
