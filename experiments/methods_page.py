@@ -44,7 +44,9 @@ ENTRIES: dict[str, Entry] = {
         "thresholds of the holes depend on the scene's scale: ours are in pixel footprints",
     ),
     "extranet+taa": Entry(
-        "ExtraSS 2023, Table 3", "ExtraNet at output resolution, TAA behind it", "TAA's settings: tuned ones"
+        "ExtraSS 2023, Table 3",
+        "ExtraNet at output resolution, TAA behind it",
+        "TAA's settings: its defaults, not tuned",
     ),
     "extranet-plus": Entry(
         "FASSET", "ExtraNet fed zero-padded high-resolution frames", "its 0.10 M parameters are not the released net's"
@@ -82,7 +84,7 @@ ENTRIES: dict[str, Entry] = {
         "jitter of its inputs",
     ),
     "ifrnet+taa": Entry(
-        "ExtraSS 2023, Table 3", "IFRNet at output resolution, TAA behind it", "TAA's settings: tuned ones"
+        "ExtraSS 2023, Table 3", "IFRNet at output resolution, TAA behind it", "TAA's settings: its defaults, not tuned"
     ),
     "bsr": Entry(
         "Yang et al. 2011", "fixed-point search for each pixel in both neighbours, then a blend", "iterations"
