@@ -1,5 +1,6 @@
 """Colour transforms, each with its inverse. Inputs ``[..., 3]`` linear HDR unless said otherwise."""
 
+import jax
 import jax.numpy as jnp
 
 from essjax.typing import Array, Color, Image, Plane
@@ -53,9 +54,13 @@ def reinhard(color: Image) -> Image:
 
 
 def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:
-    """Inverse of ``reinhard``; values above ``limit`` are clamped so that the result stays finite."""
-    encoded = jnp.clip(encoded, 0.0, limit)
-    return encoded / (1.0 - encoded)
+    """Inverse of ``reinhard``; values above ``limit`` are clamped so that the result stays finite.
+
+    Computed in float32: in 16 bits the limit would be 1.
+    """
+    dtype = jnp.result_type(encoded, 0.0)
+    clipped = jnp.clip(jnp.asarray(encoded, jnp.promote_types(dtype, jnp.float32)), 0.0, limit)
+    return (clipped / (1.0 - clipped)).astype(dtype)
 
 
 def srgb_encode(linear: Image) -> Image:
@@ -106,4 +111,5 @@ def sum_channels(image: Array) -> Array:
 
 def luminance(color: Color) -> Plane:
     """Rec. 709 luminance ``[..., 1]`` of linear colour."""
-    return color @ jnp.array([[0.2126], [0.7152], [0.0722]], color.dtype)
+    weights = jnp.array([[0.2126], [0.7152], [0.0722]], color.dtype)
+    return jnp.matmul(color, weights, precision=jax.lax.Precision.HIGHEST)  # some accelerators round products

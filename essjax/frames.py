@@ -210,8 +210,11 @@ def require(frame: Frame, names: Iterable[str], method: str) -> None:
 
 
 def check_shapes(frame: Frame, where: str = "frame") -> None:
-    """Raise a ValueError unless all images of ``frame`` agree in size and have the right number of channels."""
-    height, width = frame.motion.shape[-3:-1]
+    """Raise a ValueError unless all images of ``frame`` agree in size and have the right number of channels.
+
+    Leading axes (time, batch) must be those of motion everywhere; nothing broadcasts.
+    """
+    *leading, height, width = frame.motion.shape[:-1]
     for name, image in frame_images(frame).items():
         expected = (height, width, CHANNELS[name])
         if image.shape[-3:] != expected:
@@ -221,6 +224,42 @@ def check_shapes(frame: Frame, where: str = "frame") -> None:
             )
     if frame.jitter.shape[-1:] != (2,):
         raise ValueError(f"{where}, jitter: expected [..., 2] (x, y) in pixels, got {tuple(frame.jitter.shape)}.")
+    cores = {f"channel {name}": (image, 3) for name, image in frame_images(frame).items()}
+    cores |= {"jitter": (frame.jitter, 1), "cut": (frame.cut, 0), "exposure": (frame.exposure, 0)}
+    if frame.camera is not None:
+        camera = frame.camera
+        cores |= {"camera.camera_to_world": (camera.camera_to_world, 2)}
+        cores |= {"camera.focal": (camera.focal, 1), "camera.center": (camera.center, 1)}
+    for name, (array, rank) in cores.items():
+        shape = np.shape(array)
+        if shape[: len(shape) - rank] != tuple(leading):
+            raise ValueError(
+                f"{where}, {name}: expected the leading axes {tuple(leading)} of motion, got the shape {shape}. "
+                "Broadcast it first."
+            )
+
+
+def check_dtypes(frame: Frame, where: str = "frame") -> None:
+    """Raise a ValueError unless numbers are float32 for JAX, ids integers and ``cut`` bool.
+
+    Methods keep what they are given in their histories, whose types must not change from frame to frame.
+    """
+    arrays = frame_images(frame) | {"jitter": frame.jitter, "exposure": frame.exposure}
+    if frame.camera is not None:
+        arrays |= {f"camera.{field.name}": getattr(frame.camera, field.name) for field in dataclasses.fields(Camera)}
+    for name, array in arrays.items():
+        dtype = jnp.result_type(array)
+        if name == "stencil":
+            if not jnp.issubdtype(dtype, jnp.integer):
+                raise ValueError(f"{where}, channel stencil: expected integer ids, got {dtype}. Cast it.")
+        elif dtype != jnp.float32:
+            scale = " and bring it to its range" if jnp.issubdtype(dtype, jnp.integer) else ""
+            raise ValueError(f"{where}, {name}: expected float32, got {dtype}. Cast it to float32{scale}.")
+    if jnp.result_type(frame.cut) != jnp.bool_:
+        raise ValueError(f"{where}, cut: expected bool, got {jnp.result_type(frame.cut)}. Compare it with 0.")
+
+
+_NORMAL_TOLERANCE = 0.05  # 8 bits a component miss by 0.01
 
 
 def _reject(bad: np.ndarray, image: np.ndarray, where: str, name: str, expected: str, fix: str) -> None:
@@ -235,11 +274,12 @@ def _reject(bad: np.ndarray, image: np.ndarray, where: str, name: str, expected:
 def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] = ()) -> None:
     """Raise a ValueError that names ``where``, the channel, what was expected, what came and what to do.
 
-    Reads the values, so it belongs where data enters, outside jit. Checks presence, sizes, NaN and infinities (depth
-    may be +inf: background), signs and ranges, the jitter and the exposure.
+    Reads the values, so it belongs where data enters, outside jit. Checks presence, sizes, types, NaN and infinities
+    (depth may be +inf: background), signs and ranges, normals longer than 1, the jitter and the exposure.
     """
     require(frame, requires, where)
     check_shapes(frame, where)
+    check_dtypes(frame, where)
     for name, image in frame_images(frame).items():
         values = np.asarray(image)
         if name == "depth":
@@ -251,6 +291,10 @@ def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] =
             _reject(values < 0, values, where, name, "radiance >= 0", "Clamp it at import.")
         elif name == "stencil":
             _reject(values < 0, values, where, name, "ids >= 0", "Renumber the objects.")
+        elif name == "normal":
+            length = np.sqrt(np.einsum("...c,...c->...", values, values))
+            long = length > 1 + _NORMAL_TOLERANCE  # a mean over samples is shorter
+            _reject(long, length, where, name, "unit length", "Decode or normalise it at import.")
         elif name in ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive"):
             outside = (values < 0) | (values > 1 + 1e-3)
             _reject(outside, values, where, name, "values in [0, 1]", "Rescale or clamp it at import.")

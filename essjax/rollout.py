@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from essjax.frames import Frame, check_shapes, require, select_time, without_color
+from essjax.frames import Frame, check_dtypes, check_shapes, require, select_time, without_color
 from essjax.interfaces import Method, no_variables
 from essjax.networks import compute_dtype
 from essjax.typing import Array, Callable, PyTree, pytree
@@ -61,8 +61,12 @@ class Rollout:
 
 
 def check_supported(method: Method, frames: Frame, schedule: Schedule) -> None:
-    """Raise a ValueError where a method lacks a buffer or cannot do a kind of frame that the schedule asks for."""
+    """Raise a ValueError where a method lacks a buffer or cannot do a kind of frame that the schedule asks for.
+
+    Frames must be float32 (16 bits belong to the networks, see ``stream_step``), with the same leading axes everywhere.
+    """
     check_shapes(frames, "frames")
+    check_dtypes(frames, "frames")
     require(frames, ("color", *sorted(method.info.requires)), method.info.name)
     if method.info.renders_all and ESS in schedule.kinds(frames.motion.shape[0]):
         raise ValueError(

@@ -155,3 +155,9 @@ def test_no_motion_without_camera_motion_and_finite_gradients():
         return jnp.sum(cameras.static_motion(moved, camera(), positions, depth) ** 2)
 
     assert np.all(np.isfinite(jax.jit(jax.grad(loss))(jnp.array([0.1, 0.2, 0.3]))))
+
+
+def test_no_product_is_rounded_by_accelerators():
+    positions, depth = cameras.pixel_positions(H, W), jnp.ones((H, W, 1))
+    program = str(jax.make_jaxpr(lambda p, d: cameras.static_motion(camera(), camera(), p, d))(positions, depth))
+    assert program.count("dot_general") == program.count("precision=(Precision.HIGHEST") == 4

@@ -78,6 +78,19 @@ def test_reinhard_inverse_stays_finite():
     assert np.isfinite(color.reinhard_inverse(jnp.array([1.0, 5.0]))).all()
 
 
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_inverses_stay_finite_in_sixteen_bits(dtype):
+    """0.9999 is 1 in both types."""
+    for inverse in (color.reinhard_inverse, color.display_inverse):
+        result = inverse(jnp.array([1.0, 5.0], dtype))
+        assert result.dtype == dtype
+        np.testing.assert_allclose(result.astype(jnp.float32), 9999, rtol=1e-2)
+
+
+def test_luminance_is_not_rounded_by_accelerators():
+    assert "precision=(Precision.HIGHEST" in str(jax.make_jaxpr(color.luminance)(jnp.ones((2, 3)))).replace("\n", " ")
+
+
 @pytest.mark.parametrize(
     "transform", [color.display, color.log1p, color.srgb_encode, color.srgb_decode, color.reinhard]
 )

@@ -1,6 +1,7 @@
 """The vocabulary and its errors: each names where, which channel, what was expected, what came, what to do."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +58,61 @@ def test_wrong_size_and_channels():
         fr.check_shapes(with_gbuffer(one_frame(), depth=np.zeros((5, 7, 3))))
     with pytest.raises(ValueError, match=r"jitter: expected \[\.\.\., 2\] \(x, y\) in pixels, got \(3,\)"):
         fr.check_shapes(one_frame(jitter=np.zeros(3)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "shape"),
+    [
+        ({"normal": np.zeros((5, 7, 3), "f")}, "channel normal", (5, 7, 3)),
+        ({"jitter": np.zeros((5, 2), "f")}, "jitter", (5, 2)),
+        ({"cut": np.array(False)}, "cut", ()),
+        ({"exposure": np.ones((1, 1), "f")}, "exposure", (1, 1)),
+        ({"camera": make_frames(T=1, B=2).camera}, "camera.camera_to_world", (1, 2, 4, 4)),
+    ],
+)
+def test_leading_axes_must_agree(changes, name, shape):
+    frame = jax.tree.map(lambda leaf: leaf[None], one_frame())
+    change = with_gbuffer if "normal" in changes else dataclasses.replace
+    message = f"frame 3, {name}: expected the leading axes (1,) of motion, got the shape {shape}. Broadcast it first."
+    with pytest.raises(ValueError, match=re.escape(message)):
+        fr.validate_frame(change(frame, **changes), "frame 3")
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "message"),
+    [
+        ("color", np.uint8, "color: expected float32, got uint8. Cast it to float32 and bring it to its range."),
+        ("motion", jnp.bfloat16, "motion: expected float32, got bfloat16. Cast it to float32."),
+        ("jitter", np.float16, "jitter: expected float32, got float16. Cast it to float32."),
+        ("exposure", np.int32, "exposure: expected float32, got int32. Cast it to float32"),
+        ("cut", np.float32, "cut: expected bool, got float32. Compare it with 0."),
+    ],
+)
+def test_types(name, dtype, message):
+    frame = one_frame()
+    with pytest.raises(ValueError, match=re.escape(f"frame 3, {message}")):
+        fr.validate_frame(dataclasses.replace(frame, **{name: getattr(frame, name).astype(dtype)}), "frame 3")
+
+
+def test_types_of_buffers_and_cameras():
+    frame = one_frame()
+    with pytest.raises(ValueError, match="channel stencil: expected integer ids, got float32"):
+        fr.validate_frame(with_gbuffer(frame, stencil=frame.gbuffers.stencil + np.float32(0.5)))
+    with pytest.raises(ValueError, match="depth: expected float32, got float16"):
+        fr.validate_frame(with_gbuffer(frame, depth=frame.gbuffers.depth.astype(np.float16)))
+    camera = dataclasses.replace(frame.camera, focal=frame.camera.focal.astype(np.float16))
+    with pytest.raises(ValueError, match=r"camera.focal: expected float32, got float16"):
+        fr.validate_frame(dataclasses.replace(frame, camera=camera))
+    fr.validate_frame(with_gbuffer(frame, stencil=frame.gbuffers.stencil.astype(np.uint16)))
+
+
+def test_normals_are_no_longer_than_one():
+    frame = one_frame()
+    with pytest.raises(
+        ValueError, match=r"channel normal: expected unit length, got .*Decode or normalise it at import"
+    ):
+        fr.validate_frame(with_gbuffer(frame, normal=1.1 * frame.gbuffers.normal))
+    fr.validate_frame(with_gbuffer(frame, normal=0.7 * frame.gbuffers.normal))
 
 
 @pytest.mark.parametrize("name", ["color", "motion"])

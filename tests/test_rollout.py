@@ -158,6 +158,17 @@ def test_unsupported_frames_and_schedules():
         check_supported(toy(), without_color(frames), EVERY)
 
 
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_sixteen_bit_frames_are_refused(dtype):
+    """Histories would change their type from frame to frame."""
+    frames = make_frames(0, T=4, H=4, W=5)
+    short = dataclasses.replace(frames, color=frames.color.astype(dtype))
+    with pytest.raises(ValueError, match=f"frames, color: expected float32, got {dtype}. Cast it to float32"):
+        unroll(TOY, VARIABLES, short, EVEN)
+    with pytest.raises(ValueError, match=f"frames, motion: expected float32, got {dtype}. Cast it to float32"):
+        check_supported(TOY, dataclasses.replace(frames, motion=frames.motion.astype(dtype)), EVEN)
+
+
 def test_a_baked_method_needs_no_variables():
     frames, baked = make_frames(6, T=5, H=4, W=5), bake(TOY, VARIABLES)
     assert baked.init(jax.random.key(0), at(frames, 0)) == {} and baked.info == TOY.info

@@ -15,9 +15,7 @@ def flicker(prediction: Image, prediction_previous: Image, target: Image, target
     Raises:
       ValueError: the shapes of the frames differ.
     """
-    prediction, prediction_previous = as_float32(
-        prediction, prediction_previous, ("prediction", "prediction_previous")
-    )
+    prediction, prediction_previous = as_float32(prediction, prediction_previous, ("prediction", "prediction_previous"))
     target, target_previous = as_float32(target, target_previous, ("target", "target_previous"))
     check_same_shape(prediction, target)
     return (prediction - prediction_previous) - (target - target_previous)

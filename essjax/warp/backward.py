@@ -1,9 +1,13 @@
 """Backward warp: what the previous frame showed at this pixel."""
 
+import math
+
+import jax.numpy as jnp
+
 from essjax.cameras import pixel_positions
 from essjax.typing import Image, Motion
 from essjax.warp._batch import check_channels
-from essjax.warp.sampling import sample
+from essjax.warp.sampling import check_mode, sample
 
 
 def backward_warp(image: Image, motion: Motion, *, mode: str = "bilinear", outside: str = "border") -> Image:
@@ -26,5 +30,10 @@ def backward_warp(image: Image, motion: Motion, *, mode: str = "bilinear", outsi
     """
     check_channels("image", image, None)
     check_channels("motion", motion, 2, image.shape[-3:-1])
+    check_mode(mode, outside)
+    leading = jnp.broadcast_shapes(image.shape[:-3], motion.shape[:-3])
+    if math.prod((*leading, *image.shape[-3:])) == 0:  # an empty batch, or no channel
+        exact = mode == "nearest" or jnp.issubdtype(image.dtype, jnp.floating)
+        return jnp.zeros((*leading, *image.shape[-3:]), image.dtype if exact else jnp.float32)
     positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + motion
     return sample(image, positions, mode=mode, outside=outside)

@@ -8,7 +8,7 @@ from essjax.typing import Array, Image, Jitter, Mask, Motion, Plane
 from essjax.warp._batch import check_channels
 from essjax.warp.sampling import inside_mask, sample
 from essjax.warp.splat import splat_nearest
-from essjax.warp.upsample import jitter_aligned_upsample
+from essjax.warp.upsample import check_jitter, jitter_aligned_upsample
 
 
 def jittered_motion(motion: Motion, jitter: Jitter, jitter_previous: Jitter) -> Motion:
@@ -21,9 +21,12 @@ def jittered_motion(motion: Motion, jitter: Jitter, jitter_previous: Jitter) -> 
       motion: ``[..., H, W, 2]`` unjittered, pixels.
       jitter: ``[..., 2]`` of the current frame, pixels of the same resolution.
       jitter_previous: ``[..., 2]`` of the frame that is read.
+
+    Raises:
+      ValueError: the motion is not ``[..., H, W, 2]``, or a jitter not ``[..., 2]``.
     """
     check_channels("motion", motion, 2)
-    return motion + (jitter - jitter_previous)[..., None, None, :]
+    return motion + (check_jitter(jitter) - check_jitter(jitter_previous))[..., None, None, :]
 
 
 def compose_motion(

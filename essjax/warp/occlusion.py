@@ -14,6 +14,7 @@ from essjax.warp.sampling import axis_taps, fetch, inside_mask, sample
 _MIN_N_DOT_V = 0.1
 _TYPICAL_N_DOT_V = 0.25  # where the channel is absent: towards grazing, so that floors are not holes
 _OFF_SCREEN = 1e9  # pixels: a splat drops what goes there
+_COMPARED = {"depth": 1, "normal": 3, "world_position": 3, "stencil": 1, "n_dot_v": 1}  # buffer: channels
 _MIN_TAP_WEIGHT = 1e-3  # a tap that bilinear interpolation would ignore proves nothing
 
 
@@ -113,11 +114,15 @@ def hole_mask(
       float32 ``[..., H, W, 1]``: 1 valid, 0 hole.
 
     Raises:
-      ValueError: sizes differ, or only one of the jitters is given.
+      ValueError: sizes or numbers of channels differ, or only one of the jitters is given.
     """
+    check_channels("motion", motion, 2)
     height, width = motion.shape[-3:-1]
-    check_channels("current.depth", current.depth, 1, (height, width))
-    check_channels("previous.depth", previous.depth, 1, (height, width))
+    for name, channels in _COMPARED.items():
+        for which, gbuffers in (("current", current), ("previous", previous)):
+            image = getattr(gbuffers, name)
+            if image is not None:
+                check_channels(f"{which}.{name}", image, channels, (height, width))
     if (jitter is None) != (jitter_previous is None):
         raise ValueError("hole_mask: expected both jitter and jitter_previous or neither, got one.")
     lookup = motion if jitter is None or jitter_previous is None else jittered_motion(motion, jitter, jitter_previous)

@@ -1,6 +1,7 @@
 """A low-resolution frame resampled to the output grid, with what temporal accumulation must know of its samples."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -8,8 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from essjax.typing import Array, Image, Jitter, Mask
+from essjax.warp._batch import check_channels
 from essjax.warp.sampling import gather_pixels
-from essjax.warp.upsample import zero_upsample
+from essjax.warp.upsample import check_jitter, check_scale, zero_upsample
 
 
 class Resampled(NamedTuple):
@@ -38,7 +40,7 @@ def _nearest_three(size: int, scale: int, jitter: Array) -> tuple[Array, Array, 
     """
     position = (jnp.arange(size * scale, dtype=jnp.float32) + 0.5) / scale
     nearest = jnp.clip(jnp.floor(position - jitter), 0, size - 1)
-    index = nearest[None] + jnp.array([[0.0], [-1.0], [1.0]])
+    index = nearest[None] + jnp.array([[0.0], [-1.0], [1.0]], jnp.float32)
     distance = (index + 0.5 + jitter - position) * scale
     return index, distance, (index >= 0) & (index < size)
 
@@ -98,8 +100,14 @@ def _resample_one(color: Array, bounded: Array, jitter: Array, axis: Callable) -
 
 
 def _resample(color: Image, bounded: Image, jitter: Jitter, axis: Callable) -> Resampled:
-    leading = color.shape[:-3]
-    flat = [x.reshape(-1, *x.shape[len(leading) :]) for x in (color, bounded, jnp.broadcast_to(jitter, (*leading, 2)))]
+    check_channels("color", color, None)
+    check_channels("bounded", bounded, None, color.shape[-3:-1])
+    jitter = check_jitter(jitter)
+    leading = jnp.broadcast_shapes(color.shape[:-3], bounded.shape[:-3], jitter.shape[:-1])
+    flat = [
+        jnp.broadcast_to(x, (*leading, *core)).reshape(math.prod(leading), *core)
+        for x, core in ((color, color.shape[-3:]), (bounded, bounded.shape[-3:]), (jitter, (2,)))
+    ]
     results = jax.vmap(lambda c, b, j: _resample_one(c, b, j, axis))(*flat)
     return jax.tree.map(lambda x: x.reshape(*leading, *x.shape[1:]), results)
 
@@ -113,14 +121,19 @@ def gaussian_resample(color: Image, bounded: Image, jitter: Jitter, sigma: Array
       jitter: ``[..., 2]`` LR pixels.
       sigma: standard deviation in *output* pixels (our reading: eq 40 measures distance in them), a scalar array.
       scale: whole number.
+
+    Raises:
+      ValueError: the scale is no whole number >= 1, or wrong shapes.
     """
+    scale = check_scale(scale)
     return _resample(color, bounded, jitter, lambda size, j: _gaussian_axis(size, scale, j, sigma))
 
 
 def tent_resample(color: Image, bounded: Image, jitter: Jitter, scale: int) -> Resampled:
     """Resample with a tent of one output pixel (eq 38, 40); β is 1 in the pixel that a sample fell into, else 0.
 
-    The colour is 0 where no sample is within a pixel, as is β there. Arguments as ``gaussian_resample``.
+    The colour is 0 where no sample is within a pixel, as is β there. Arguments and errors as ``gaussian_resample``.
     """
+    scale = check_scale(scale)
     resampled = _resample(color, bounded, jitter, lambda size, j: _tent_axis(size, scale, j))
     return resampled._replace(weight=zero_upsample(jnp.ones_like(color[..., :1]), scale, jitter))

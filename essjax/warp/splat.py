@@ -1,5 +1,7 @@
 """Forward warps: every pixel is written where its motion points."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -14,7 +16,7 @@ _MARGIN = 2  # positions are clamped to 1 pixel outside: every 2x2 window lies i
 def _splat_windows(image: Array, motion: Array) -> Array:
     """``[B, H, W, C]`` and ``[B, H, W, 2]``, or one image. One scatter of 2x2 windows is faster than four of pixels."""
     *batch, height, width, channels = image.shape
-    target = pixel_positions(height, width) + motion
+    target = pixel_positions(height, width) + motion.astype(jnp.float32)
     first_column, columns = _axis_pair(target[..., 0], width)
     first_row, rows = _axis_pair(target[..., 1], height)
     size = (*batch, height + 2 * _MARGIN, width + 2 * _MARGIN, channels)
@@ -30,12 +32,17 @@ def _splat_windows(image: Array, motion: Array) -> Array:
         ),
         mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
-    return total.reshape(size)[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN, :].astype(image.dtype)
+    result = total.reshape(size)[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN, :]
+    return result.astype(_result_type(image))
+
+
+def _result_type(image: Array) -> jnp.dtype:
+    return image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else jnp.dtype(jnp.float32)
 
 
 def _axis_pair(positions: Array, size: int) -> tuple[Array, Array]:
     """First of the two pixels ``[..., H, W]`` around a position on one axis, their weights ``[..., H, W, 2]``."""
-    x = jnp.clip(positions, -1.0, size + 1.0) - 0.5
+    x = jnp.where(positions > -1.0, jnp.minimum(positions, size + 1.0), -1.0) - 0.5  # NaN goes outside
     first = jnp.floor(x)
     return first.astype(jnp.int32), jnp.stack([1.0 - (x - first), x - first], axis=-1)
 
@@ -48,14 +55,19 @@ def splat(image: Image, motion: Motion) -> Image:
 
     Args:
       image: ``[..., H, W, C]`` of the current frame.
-      motion: ``[..., H, W, 2]`` pixels, current to previous.
+      motion: ``[..., H, W, 2]`` pixels, current to previous; a pixel whose motion is NaN is lost.
 
     Returns:
-      ``[..., H, W, C]`` on the previous frame's pixels.
+      ``[..., H, W, C]`` on the previous frame's pixels; of integers float32.
+
+    Raises:
+      ValueError: sizes differ.
     """
     check_channels("image", image, None)
     check_channels("motion", motion, 2, image.shape[-3:-1])
     leading = jnp.broadcast_shapes(image.shape[:-3], motion.shape[:-3])
+    if math.prod((*leading, *image.shape[-3:])) == 0:
+        return jnp.zeros((*leading, *image.shape[-3:]), _result_type(image))
     result = _splat_windows(
         *(merge_leading_axes(jnp.broadcast_to(x, (*leading, *x.shape[-3:]))) for x in (image, motion))
     )
@@ -65,11 +77,11 @@ def splat(image: Image, motion: Motion) -> Image:
 def _splat_nearest_one(image: Array, depth: Array, motion: Array) -> tuple[Array, Array]:
     height, width, channels = image.shape
     count = height * width
-    target = (pixel_positions(height, width) + motion).reshape(-1, 2)
-    inside = jnp.all((target >= 0) & (target < jnp.array([width, height])), axis=-1)
+    target = (pixel_positions(height, width) + motion.astype(jnp.float32)).reshape(-1, 2)
+    depth = depth.reshape(-1)
+    inside = jnp.all((target >= 0) & (target < jnp.array([width, height])), axis=-1) & ~jnp.isnan(depth)
     cell = jnp.where(inside[:, None], jnp.floor(target), 0.0).astype(jnp.int32)
     index = jnp.where(inside, cell[:, 1] * width + cell[:, 0], count)  # outside: past the end, dropped
-    depth = depth.reshape(-1)
     nearest = jnp.full(count, jnp.inf).at[index].min(depth, mode="drop")
     wins = inside & (depth == nearest.at[index].get(mode="clip"))
     # A second minimum, over pixel numbers, makes the winner the same on every backend where depths tie.
@@ -90,11 +102,14 @@ def splat_nearest(image: Image, depth: Plane, motion: Motion) -> tuple[Image, Ma
     Args:
       image: ``[..., H, W, C]`` of the current frame; integers and infinities pass unchanged.
       depth: ``[..., H, W, 1]`` of the current frame, background +inf. Ties: first in rows.
-      motion: ``[..., H, W, 2]`` pixels, current to previous.
+      motion: ``[..., H, W, 2]`` pixels, current to previous; a pixel whose motion or depth is NaN is lost.
 
     Returns:
       The image ``[..., H, W, C]`` on the previous frame's pixels, 0 where nothing was written, and the mask
       ``[..., H, W, 1]`` of where something was.
+
+    Raises:
+      ValueError: sizes differ.
     """
     size = motion.shape[-3:-1]
     check_channels("image", image, None, size)

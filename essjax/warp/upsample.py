@@ -1,5 +1,8 @@
 """From low-resolution, jittered samples to a high-resolution grid, and blocks to channels and back."""
 
+import functools
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
@@ -9,10 +12,19 @@ from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.sampling import Tap, axis_taps, check_mode, gather_pixels, sample
 
 
-def _check_scale(scale: int, name: str = "scale") -> int:
+def check_scale(scale: int, name: str = "scale") -> int:
+    """The scale as an int; raise a ValueError unless it is a whole number >= 1."""
     if int(scale) != scale or scale < 1:
         raise ValueError(f"{name}: expected a whole number >= 1, got {scale!r}.")
     return int(scale)
+
+
+def check_jitter(jitter: Jitter | Sequence[float]) -> Array:
+    """The jitter as a float32 array; raise a ValueError unless it is ``[..., 2]``."""
+    jitter = jnp.asarray(jitter, jnp.float32)
+    if jitter.shape[-1:] != (2,):
+        raise ValueError(f"jitter: expected [..., 2] (x, y) in LR pixels, got {jitter.shape}.")
+    return jitter
 
 
 def _sample_offset(jitter: Jitter, scale: int) -> Array:
@@ -32,11 +44,14 @@ def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Image:
 
     Returns:
       ``[..., scale * H, scale * W, C]``.
+
+    Raises:
+      ValueError: the scale is no whole number >= 1, or wrong shapes.
     """
-    scale = _check_scale(scale)
+    scale = check_scale(scale)
     check_channels("image", image, None)
     height, width, channels = image.shape[-3:]
-    offset = _sample_offset(jitter, scale)
+    offset = _sample_offset(check_jitter(jitter), scale)
     here = jnp.arange(scale) == offset[..., None]  # [..., 2, scale]: x, y
     hit = (here[..., 1, :, None] & here[..., 0, None, :])[..., None, :, None, :, None]
     blocks = jnp.where(hit, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
@@ -68,8 +83,11 @@ def sample_zero_upsampled(image: Image, positions: Positions, scale: int, jitter
 
     Returns:
       ``[..., h, w, C]``.
+
+    Raises:
+      ValueError: the scale is no whole number >= 1, or wrong shapes.
     """
-    scale = _check_scale(scale)
+    scale, jitter = check_scale(scale), check_jitter(jitter)
     if scale == 1:
         return sample(image, positions, outside="zeros")
     check_channels("image", image, None)
@@ -83,17 +101,17 @@ def sample_zero_upsampled(image: Image, positions: Positions, scale: int, jitter
         value = gather_pixels(image.reshape(-1, channels), row.index * width + column.index)
         return value * (row.weight * column.weight)[..., None].astype(image.dtype)
 
-    return over_leading_axes(one, (3, 3, 1), image, jax.lax.stop_gradient(positions), jnp.asarray(jitter))
+    return over_leading_axes(one, (3, 3, 1), image, jax.lax.stop_gradient(positions), jitter)
 
 
 def _along(image: Array, taps: list[Tap], axis: int) -> Array:
     """Interpolate a ``[H, W, C]`` image along axis 0 or 1 at the taps' positions."""
     shape = (-1, 1, 1) if axis == 0 else (1, -1, 1)
-    return sum(
-        jnp.asarray(image).at[(slice(None),) * axis + (tap.index,)].get(mode="promise_in_bounds").astype(jnp.float32)
-        * tap.weight.reshape(shape)
-        for tap in taps
-    )  # type: ignore[return-value]
+    values = [jnp.asarray(image).at[(slice(None),) * axis + (tap.index,)].get(mode="promise_in_bounds") for tap in taps]
+    if len(taps) == 1:  # nearest, no arithmetic: integers stay exact
+        return values[0]
+    weighted = (value.astype(jnp.float32) * tap.weight.reshape(shape) for value, tap in zip(values, taps, strict=True))
+    return functools.reduce(jnp.add, weighted)
 
 
 def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode: str = "bilinear") -> Image:
@@ -108,13 +126,14 @@ def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode:
       mode: see ``sample``; the border repeats.
 
     Returns:
-      ``[..., round(scale * H), round(scale * W), C]``.
+      ``[..., round(scale * H), round(scale * W), C]``; of integers float32, except that "nearest" keeps them.
 
     Raises:
       ValueError: unknown mode, wrong shapes, or a scale that is not positive.
     """
     check_mode(mode)
     check_channels("image", image, None)
+    jitter = check_jitter(jitter)
     if not scale > 0:
         raise ValueError(f"scale: expected a positive number, got {scale!r}.")
     height, width = image.shape[-3:-1]
@@ -123,9 +142,10 @@ def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode:
     def one(image: Array, jitter: Array) -> Array:
         wide = _along(image, axis_taps(columns - jitter[0], width, mode, "border"), axis=1)
         wide = jax.lax.optimization_barrier(wide)  # else every tap along the other axis computes it again
-        return _along(wide, axis_taps(rows - jitter[1], height, mode, "border"), axis=0).astype(image.dtype)
+        result = _along(wide, axis_taps(rows - jitter[1], height, mode, "border"), axis=0)
+        return result.astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.floating) else result
 
-    return over_leading_axes(one, (3, 1), image, jnp.asarray(jitter))
+    return over_leading_axes(one, (3, 1), image, jitter)
 
 
 def sample_distance(height: int, width: int, scale: int, jitter: Jitter) -> Positions:
@@ -139,10 +159,13 @@ def sample_distance(height: int, width: int, scale: int, jitter: Jitter) -> Posi
 
     Returns:
       ``[..., scale * height, scale * width, 2]`` (x, y) in HR pixels; within +-scale.
+
+    Raises:
+      ValueError: the scale is no whole number >= 1, or the jitter is not ``[..., 2]``.
     """
-    scale = _check_scale(scale)
+    scale = check_scale(scale)
     centers = pixel_positions(height * scale, width * scale)
-    samples = jnp.floor(centers / scale) + 0.5 + jitter[..., None, None, :]
+    samples = jnp.floor(centers / scale) + 0.5 + check_jitter(jitter)[..., None, None, :]
     return samples * scale - centers
 
 
@@ -154,7 +177,7 @@ def space_to_depth(x: Image, block: int) -> Image:
     Raises:
       ValueError: H or W is not a multiple of ``block``.
     """
-    block = _check_scale(block, "block")
+    block = check_scale(block, "block")
     height, width, channels = x.shape[-3:]
     if height % block or width % block:
         raise ValueError(
@@ -171,7 +194,7 @@ def depth_to_space(x: Image, block: int) -> Image:
     Raises:
       ValueError: the channels are not a multiple of ``block``^2.
     """
-    block = _check_scale(block, "block")
+    block = check_scale(block, "block")
     height, width, channels = x.shape[-3:]
     if channels % block**2:
         raise ValueError(f"depth_to_space: expected a multiple of {block**2} channels, got {channels}.")

@@ -144,6 +144,17 @@ def test_batch_elements_are_independent():
     assert (np.asarray(got[1]) == 1).all()
 
 
+@pytest.mark.parametrize("which", ["current", "previous"])
+@pytest.mark.parametrize(("name", "channels"), [("normal", 3), ("world_position", 3), ("stencil", 1), ("n_dot_v", 1)])
+def test_buffers_of_another_size_are_refused(which, name, channels):
+    world = {"current": wall(1, 2), "previous": wall(1, 2)}
+    small = getattr(world[which], name)[: H // 2, : W // 2]
+    world[which] = dataclasses.replace(world[which], **{name: small})
+    message = rf"{which}.{name}: expected \[..., 9, 16, {channels}\], got \(4, 8, {channels}\)"
+    with pytest.raises(ValueError, match=message):
+        hole_mask(world["current"], world["previous"], jnp.zeros((H, W, 2)))
+
+
 def test_needs_both_jitters():
     with pytest.raises(ValueError, match="hole_mask: expected both jitter and jitter_previous or neither"):
         hole_mask(wall(1, 2), wall(1, 2), jnp.zeros((H, W, 2)), jitter=jnp.zeros(2))

@@ -76,3 +76,28 @@ def test_tent_against_brute_force(scale):
             assert float(got.weight[y, x, 0]) == inside
             hits += inside
     assert hits == H * W  # each sample is in one pixel
+
+
+def test_leading_axes_broadcast():
+    color, jitter = random_image(0, H, W, 2), random_image(1, 5, 2, low=-0.5, high=0.5)
+    got = gaussian(color, jitter, jnp.float32(0.6), 2)
+    assert got.color.shape == (5, 2 * H, 2 * W, 2) and got.weight.shape == (5, 2 * H, 2 * W, 1)
+    np.testing.assert_allclose(got.color[3], gaussian(color, jitter[3], jnp.float32(0.6), 2).color, rtol=1e-6)
+
+
+def test_float32_under_x64():
+    color, jitter = np.ones((H, W, 2), np.float32), np.zeros(2, np.float32)
+    with jax.enable_x64(True):
+        got = gaussian_resample(jnp.asarray(color), jnp.asarray(color), jnp.asarray(jitter), jnp.float32(0.6), 2)
+        assert {leaf.dtype for leaf in got} == {jnp.dtype("float32")}
+
+
+@pytest.mark.parametrize("resample", [lambda *a: gaussian_resample(*a[:3], jnp.float32(0.5), a[3]), tent_resample])
+def test_errors_name_the_argument(resample):
+    image, jitter = jnp.zeros((H, W, 3)), jnp.zeros(2)
+    with pytest.raises(ValueError, match=r"bounded: expected \[..., 3, 4, C\], got \(6, 6, 3\)"):
+        resample(image, jnp.zeros((6, 6, 3)), jitter, 2)
+    with pytest.raises(ValueError, match="scale: expected a whole number >= 1, got 1.5"):
+        resample(image, image, jitter, 1.5)
+    with pytest.raises(ValueError, match=r"color: expected \[..., H, W, C\], got \(3, 4\)"):
+        resample(image[..., 0], image, jitter, 2)

@@ -91,6 +91,52 @@ def test_nearest_depth_wins_against_brute_force(seed, size):
     np.testing.assert_array_equal(mask, expected_mask)
 
 
+def test_a_motion_that_is_nan_loses_its_pixel_only():
+    image = np.ones((2, H, W, 1), np.float32)
+    motion = np.zeros((2, H, W, 2), np.float32)
+    motion[1, 3, 4, 0] = np.nan
+    expected = image.copy()
+    expected[1, 3, 4] = 0
+    np.testing.assert_array_equal(scatter(image, motion), expected)
+    np.testing.assert_array_equal(nearest(image, image, motion)[1], expected)
+    to_image, to_motion = jax.grad(lambda i, m: jnp.sum(splat(i, m) ** 2), (0, 1))(image, motion)
+    assert np.isfinite(to_image).all() and np.isfinite(to_motion).all()
+
+
+def test_a_depth_that_is_nan_loses_its_pixel_only():
+    """Two valid pixels and one without a depth land on column 1: the nearer valid one is seen."""
+    image = np.float32([[[5.0], [6.0], [7.0]]])
+    depth = np.float32([[[3.0], [np.nan], [2.0]]])
+    motion = np.float32([[[1, 0], [0, 0], [-1, 0]]])
+    got, covered = nearest(image, depth, motion)
+    np.testing.assert_array_equal(got[0, :, 0], [0, 7, 0])
+    np.testing.assert_array_equal(covered[0, :, 0], [0, 1, 0])
+
+
+def test_splat_of_integers_is_float32():
+    got = splat(np.full((H, W, 1), 2, np.int32), np.full((H, W, 2), 0.25, np.float32))
+    assert got.dtype == jnp.float32 and float(got[0, 0, 0]) == 2 * 0.75**2
+
+
+@pytest.mark.parametrize(("leading", "channels"), [((0,), 3), ((2, 0), 3), ((), 0)])
+def test_nothing_splats_and_warps_to_nothing(leading, channels):
+    image, motion = jnp.zeros((*leading, H, W, channels)), jnp.zeros((H, W, 2))
+    for result in (splat(image, motion), backward_warp(image, motion), backward_warp(image, motion, mode="bicubic")):
+        assert result.shape == image.shape and result.dtype == jnp.float32
+    whole = image.astype(jnp.int32)
+    assert backward_warp(whole, motion).dtype == splat(whole, motion).dtype == jnp.float32
+    assert backward_warp(whole, motion, mode="nearest").dtype == jnp.int32
+
+
+def test_float64_motion():
+    image, motion = np.ones((H, W, 1), np.float32), np.full((H, W, 2), 0.25)
+    expected = splat(image, motion.astype(np.float32))
+    with jax.enable_x64(True):
+        assert jnp.asarray(motion).dtype == jnp.float64
+        np.testing.assert_array_equal(splat(image, jnp.asarray(motion)), expected)
+        assert splat_nearest(image, image, jnp.asarray(motion))[0].dtype == jnp.float32
+
+
 def test_nearest_splat_errors():
     with pytest.raises(ValueError, match=r"depth: expected \[..., 8, 11, 1\], got \(7, 11, 1\)"):
         splat_nearest(jnp.zeros((H, W, 2)), jnp.zeros((H - 1, W, 1)), jnp.zeros((H, W, 2)))

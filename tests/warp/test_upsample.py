@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from essjax.cameras import pixel_positions
 from essjax.warp import (
     depth_to_space,
+    gaussian_resample,
     jitter_aligned_upsample,
+    jittered_motion,
     sample,
     sample_distance,
     sample_zero_upsampled,
@@ -151,6 +153,35 @@ def test_gradients_are_finite_and_complete():
     to_image, to_jitter = jax.jit(jax.grad(loss, (0, 1)))(image_of(4), jnp.zeros(2))
     assert np.isfinite(to_image).all() and np.isfinite(to_jitter).all()
     assert float(to_image.sum()) == pytest.approx(4 * H * W * 3, rel=1e-5)
+
+
+def test_nearest_keeps_integers_and_interpolated_integers_are_float32():
+    """16777217 = 2^24 + 1 is the first integer that float32 lacks."""
+    ids = np.full((H, W, 1), 2**24 + 1, np.int32)
+    got = jitter_aligned_upsample(ids, 2, (0.1, -0.2), mode="nearest")
+    assert got.dtype == jnp.int32 and (np.asarray(got) == 2**24 + 1).all()
+    mixed = jitter_aligned_upsample(np.arange(W, dtype=np.uint8)[None, :, None].repeat(H, 0), 2, (0.0, 0.0))
+    assert mixed.dtype == jnp.float32
+    np.testing.assert_allclose(mixed[0, 1:5, 0], [0.25, 0.75, 1.25, 1.75])
+
+
+TAKE_JITTER = {
+    "zero_upsample": lambda jitter: zero_upsample(image_of(0), 2, jitter),
+    "sample_zero_upsampled": lambda jitter: sample_zero_upsampled(image_of(0), jnp.ones((2, 2, 2)), 2, jitter),
+    "jitter_aligned_upsample": lambda jitter: jitter_aligned_upsample(image_of(0), 2, jitter),
+    "sample_distance": lambda jitter: sample_distance(H, W, 2, jitter),
+    "gaussian_resample": lambda jitter: gaussian_resample(image_of(0), image_of(0), jitter, jnp.float32(0.5), 2).color,
+    "jittered_motion": lambda jitter: jittered_motion(jnp.zeros((H, W, 2)), jitter, jitter),
+}
+
+
+@pytest.mark.parametrize("name", TAKE_JITTER)
+def test_jitter_is_two_numbers_in_any_container(name):
+    function = TAKE_JITTER[name]
+    np.testing.assert_array_equal(function((0.1, -0.2)), function(jnp.array([0.1, -0.2])))
+    for length in (1, 3):
+        with pytest.raises(ValueError, match=rf"jitter: expected \[..., 2\] .x, y. in LR pixels, got \({length},\)"):
+            function(jnp.zeros(length))
 
 
 def test_errors_name_the_argument():
