@@ -10,8 +10,8 @@ import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
 from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
 
-RENDERER = "essjax.scenes"
-"""How datasets of the built-in renderer name it."""
+RENDERER = "essjax.scenes 2"
+"""How datasets of the built-in renderer name it; the number grows when the same seed gives another picture."""
 UNSAID = {"jitter": "halton", "ranges": False}
 """Settings that a dataset names only if they differ from these: it may be older than the choice."""
 Progress = Callable[[int, int], Any]
@@ -80,7 +80,7 @@ def _check_request(out: Path, clips: Sequence[Clip], settings: dict) -> dict[str
     if not (out / "dataset.json").is_file():
         return {}
     dataset = read_dataset(out)
-    for key, asked in {**UNSAID, **settings}.items():
+    for key, asked in {**UNSAID, "renderer": RENDERER, **settings}.items():
         found = dataset.source.get(key, UNSAID.get(key))
         if found != asked:
             raise ValueError(

@@ -8,10 +8,16 @@ from essjax.data import Dataset, read_dataset
 from essjax.generate import Clip, generate, plan
 from experiments.config import Config
 
+ROUNDS = 10_000
+"""Scenes per family that belong to one seed of a run."""
+
 
 def train_clips(config: Config, number: int = 0) -> list[Clip]:
-    """Round ``number`` of scenes to train on: 0 are those on disk, each further one (``fresh``) has new seeds."""
-    start = config.seed + number * config.train_sequences
+    """Round ``number`` of scenes to train on: 0 are those on disk, each further one (``fresh``) has new seeds.
+
+    Runs with different seeds share no scene.
+    """
+    start = config.seed * ROUNDS + number * config.train_sequences
     return plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=start)
 
 

@@ -56,10 +56,11 @@ def jitter_sequence(
 ) -> np.ndarray:
     """Jitter of each frame, pixels in [-0.5, 0.5).
 
-    "halton" is Halton (2, 3). Frame n takes element n // 2, so that even frames alone and odd frames alone cover the
-    pixel (SPEC section 0): plain Halton by n puts even and odd n into opposite halves. The two frames of a pair share a
-    jitter. "dlctus" is ``dlctus_pattern``, indexed by n: for methods that get every frame rendered. Half the frames
-    alone see half of it.
+    "halton" is Halton (2, 3): frame n takes element n // 2, and odd frames are half a pixel further in both directions,
+    modulo a pixel. So even frames alone, odd frames alone and all together cover the pixel, for methods that render
+    every other frame and methods that render all (docs/adr/0010-jitter-for-both.md); plain Halton by n puts even and
+    odd n into opposite halves. "dlctus" is ``dlctus_pattern``, indexed by n: for methods that get every frame rendered.
+    Half the frames alone see half of it.
 
     Args:
       length: number of frames.
@@ -79,8 +80,10 @@ def jitter_sequence(
     if pattern == "dlctus":
         return dlctus_pattern(scale)[np.arange(length) % 16].reshape(length, 2)
     steps = range(length) if every_frame else [n // 2 for n in range(length)]
-    points = [(halton(1 + k % period, 2) - 0.5, halton(1 + k % period, 3) - 0.5) for k in steps]
-    return np.asarray(points, np.float32).reshape(length, 2)
+    points = np.array([(halton(1 + k % period, 2), halton(1 + k % period, 3)) for k in steps]).reshape(length, 2)
+    if not every_frame:
+        points[1::2] = (points[1::2] + 0.5) % 1.0
+    return (points - 0.5).astype(np.float32)
 
 
 def reference_samples(count: int) -> np.ndarray:

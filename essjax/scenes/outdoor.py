@@ -199,7 +199,8 @@ def cuts(b: Builder) -> None:
         eye = path(reach * np.sin(angle), height, reach * np.cos(angle))
         target = path(swing(b, 0.8, 0.03), rng.uniform(0.8, 1.8), swing(b, 0.8, 0.03))
         shots.append(look_at(eye, target))
-    length, shot, left = b.frames, 0, int(rng.integers(8, 13))
+    b.focal = np.full(b.frames, rng.uniform(0.8, 0.95))
+    length, shot, left = b.frames, 0, int(rng.integers(3, 6))  # so early that short clips have a cut, too
     chosen = np.zeros(length, int)
     for n in range(length):
         if left == 0:
@@ -207,4 +208,3 @@ def cuts(b: Builder) -> None:
             b.cut[n] = True
         chosen[n], left = shot % len(shots), left - 1
     b.camera = np.stack(shots)[chosen, np.arange(length)]
-    b.focal = np.full(length, rng.uniform(0.8, 0.95))

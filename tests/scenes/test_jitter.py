@@ -9,11 +9,15 @@ def test_halton_by_hand():
     np.testing.assert_allclose([halton(k, 3) for k in (1, 2, 3, 4)], [1 / 3, 2 / 3, 1 / 9, 4 / 9])
 
 
-def test_pairs_share_a_jitter_and_range():
+def test_odd_frames_are_half_a_pixel_further():
     jitter = jitter_sequence(33)
     assert jitter.shape == (33, 2) and jitter.dtype == np.float32
-    np.testing.assert_array_equal(jitter[0:32:2], jitter[1:32:2])
+    np.testing.assert_allclose(np.abs(jitter[1:32:2] - jitter[0:32:2]), 0.5, atol=1e-6)
     assert (jitter >= -0.5).all() and (jitter < 0.5).all()
+    # Halton by hand: elements (1/2, 1/3) and (1/4, 2/3).
+    np.testing.assert_allclose(
+        jitter[:4] + 0.5, [(1 / 2, 1 / 3), (0, 5 / 6), (1 / 4, 2 / 3), (3 / 4, 1 / 6)], atol=1e-6
+    )
 
 
 def covered_cells(points, cells):
@@ -26,6 +30,7 @@ def test_even_frames_alone_and_odd_frames_alone_cover_the_pixel():
     for parity in (0, 1):
         assert covered_cells(jitter[parity::2], 4) >= 13  # of 16 cells by 16 points
         assert set(np.sign(jitter[parity:16:2, 0] + 1e-6)) == {-1, 1}
+    assert covered_cells(jitter, 6) >= 24  # of 36 cells by 32 points; if pairs shared a jitter, 16 at most
     # Why it is indexed by n // 2: by n, even and odd frames fall into opposite halves of the pixel.
     assert (plain[0:16:2, 0] >= 0).all() or (plain[0:16:2, 0] < 0).all()
 

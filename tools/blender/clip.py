@@ -21,12 +21,12 @@ def halton(index: int, base: int) -> float:
 
 
 def jitter(frame: int) -> tuple[float, float]:
-    """(x right, y down) in LR pixels, in [-0.5, 0.5): Halton (2, 3) by ``frame // 2``.
+    """(x right, y down) in LR pixels, in [-0.5, 0.5): Halton (2, 3) by ``frame // 2``, odd frames half a pixel further.
 
-    Two frames share an element, so that even frames alone and odd frames alone cover the pixel.
+    So even frames alone, odd frames alone and all together cover the pixel.
     """
-    index = 1 + (frame // 2) % PERIOD
-    return halton(index, 2) - 0.5, halton(index, 3) - 0.5
+    index, shift = 1 + (frame // 2) % PERIOD, frame % 2 / 2
+    return (halton(index, 2) + shift) % 1 - 0.5, (halton(index, 3) + shift) % 1 - 0.5
 
 
 def camera_shift(jitter: tuple[float, float], width: int, height: int, sensor_fit: str) -> tuple[float, float]:
