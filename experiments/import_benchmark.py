@@ -72,7 +72,9 @@ def make_dump(folder: Path, frames: int) -> None:
         grain = 1 + 0.02 * noise.standard_normal((HEIGHT, WIDTH, 3), np.float32)
         half = {name: 3 * waves[..., i] * grain[..., i] for i, name in enumerate("RGB")}
         half |= {f"base.{name}": waves[..., 3 + i] for i, name in enumerate("RGB")}
-        half |= {f"N.{name}": waves[..., 6 + i] - 0.4 for i, name in enumerate("XYZ")}
+        normal = waves[..., 6:9] - 0.4
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        half |= {f"N.{name}": normal[..., i] for i, name in enumerate("XYZ")}
         half |= {"rough.Y": waves[..., 9], "metal.Y": np.round(waves[..., 10]), "id.Y": np.round(3 * waves[..., 9])}
         full = {"depth.Z": 0.1 / (1 + 20 * waves[..., 10]), "motion.X": 0.02 * waves[..., 11]}
         full["motion.Y"] = 0.01 * waves[..., 12]
