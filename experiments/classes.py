@@ -74,7 +74,7 @@ def evaluate_classes(
         if at:
             n = max(at, key=lambda n: (automatic["ghosting"][n] < 2).mean())
             chosen = [{name: classes[name][n] for name in QUESTIONS} for classes in (predicted, automatic)]
-            maps.append(ClassMaps(clip.name, clip.numbers[n], np.asarray(clip.sequence.reference[n]), *chosen))
+            maps.append(ClassMaps(clip.name, clip.numbers[n], np.array(clip.sequence.reference[n]), *chosen))
     return _scores(counts), maps
 
 

@@ -13,7 +13,7 @@ from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.typing import PyTree
 from experiments.config import Config
-from experiments.evaluate import Clip, Runner
+from experiments.evaluate import Clip, Clips, Runner
 from experiments.tuning import Setting, setting_variables, tune
 from experiments.variants import VARIANTS, compared, stages_of, trained_as
 
@@ -63,7 +63,7 @@ def make_runners(
     names: Sequence[str],
     config: Config,
     trained: Mapping[str, Trained],
-    validation: list[Clip],
+    validation: Clips,
     out: Path,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict[str, Runner], dict[str, Setting]]:
@@ -79,17 +79,18 @@ def make_runners(
       out: folder of the run.
       on_step: called with what is being tuned.
     """
-    native = validation[0].sequence.native is not None
+    example = validation.outline(0).sequence
+    native = example.native is not None
     runners, settings = {}, {}
     kept = _read_settings(out / "tuning.json")
-    frames = select_time(validation[0].sequence.frames, 0)
+    frames = select_time(example.frames, 0)
     for row in compared(names):
         variant, owner = VARIANTS[row], _owner(row, names, trained)
         own_config = trained[owner].config if owner else config
         method = variant.method(own_config)
         if method.info.native and not native:
             continue
-        if row not in names and unfit(method, validation[0].sequence):
+        if row not in names and unfit(method, example):
             continue
         if variant.tuned and config.tune:
             if row not in kept:

@@ -1,5 +1,6 @@
 """Run methods over the test frames, twice with swapped parity, and score every frame as SS and as ESS (SPEC 0)."""
 
+import collections.abc
 import dataclasses
 import functools
 import threading
@@ -14,6 +15,7 @@ import numpy as np
 from essjax.cameras import pixel_positions
 from essjax.color import display
 from essjax.data import Dataset, Segment, read_segment
+from essjax.data.memory import Kept
 from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
 from essjax.interfaces import Method
 from essjax.metrics import aggregate, mean_over, psnr, score_rollout
@@ -47,9 +49,9 @@ class Clip:
     exact_holes: bool
 
 
-def load_clip(dataset: Dataset, segment: Segment, warmup: int, *, ranges: bool = False) -> Clip:
+def load_clip(dataset: Dataset, segment: Segment, warmup: int, *, native: bool = True, ranges: bool = False) -> Clip:
     """Read a test segment; the first ``warmup`` frames and as many after each cut are not scored."""
-    sequence = read_segment(dataset, segment, ranges=ranges)
+    sequence = read_segment(dataset, segment, native=native, ranges=ranges)
     since_cut, scored = 0, []
     for n, (cut, counts) in enumerate(zip(np.asarray(sequence.frames.cut), dataset.scored(segment), strict=True)):
         since_cut = 0 if cut or n == 0 else since_cut + 1
@@ -57,6 +59,50 @@ def load_clip(dataset: Dataset, segment: Segment, warmup: int, *, ranges: bool =
             scored.append(n)
     holes = 1.0 - np.asarray(_estimated_valid(sequence.frames) if sequence.valid is None else sequence.valid)
     return Clip(segment.sequence, sequence, dataset.numbers(segment), scored, holes, sequence.valid is not None)
+
+
+class Clips(collections.abc.Sequence[Clip]):
+    """The clips of a split, a sequence of ``Clip``: each is read when asked for, and kept if there is memory for it."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        warmup: int,
+        *,
+        native: bool = True,
+        ranges: bool = False,
+        memory: int | None = None,
+    ):
+        """Nothing is read yet.
+
+        Args:
+          dataset: from ``read_dataset``.
+          split: its name.
+          warmup: see ``load_clip``.
+          native: read native frames too, where there are any.
+          ranges: read sample ranges too, where there are any.
+          memory: bytes of all clips that are kept; None: half of what is free.
+        """
+        self._segments, self._kept, self._outlines = dataset.segments(split), Kept(memory), {}
+        self._load = functools.partial(load_clip, dataset, warmup=warmup, native=native, ranges=ranges)
+
+    def __len__(self) -> int:
+        return len(self._segments)
+
+    def __getitem__(self, index: int) -> Clip:
+        segment = self._segments[index]
+        clip = Clip(**self._kept.get(index, lambda: vars(self._load(segment))))
+        if index not in self._outlines:
+            first = jax.tree.map(lambda leaf: np.array(leaf[:1]), clip.sequence)
+            self._outlines[index] = dataclasses.replace(clip, sequence=first)
+        return clip
+
+    def outline(self, index: int) -> Clip:
+        """Clip ``index`` with the images of its first frame alone; stays in memory."""
+        if index not in self._outlines:
+            _ = self[index]
+        return self._outlines[index]
 
 
 @jax.jit
@@ -162,7 +208,7 @@ def picture_frames(clip: Clip, count: int) -> list[int]:
 
 def evaluate(
     runners: Mapping[str, Runner],
-    clips: list[Clip],
+    clips: collections.abc.Sequence[Clip],
     *,
     pictures: int = 1,
     on_step: Callable[[str], None] = lambda text: None,
@@ -171,7 +217,7 @@ def evaluate(
 
     Args:
       runners: method name -> runner, in the order of the table.
-      clips: the test sequences.
+      clips: the test sequences; one is in use at a time.
       pictures: chosen frames per sequence.
       on_step: called before each (method, sequence).
 
@@ -182,24 +228,24 @@ def evaluate(
     curves: dict[str, dict[str, list]] = {name: {} for name in runners}
     shown: dict[tuple, dict] = {}
 
-    def run_method(name: str) -> None:
+    def run_method(name: str, clip: Clip) -> None:
         runner = runners[name]
-        for clip in clips:
-            on_step(f"{name} on {clip.name}")
-            curves[name][clip.name] = []
-            for schedule in schedules(runner.method):
-                kinds = schedule.kinds(len(clip.numbers))
-                images = runner(clip.sequence, schedule)
-                curves[name][clip.name] += score_clip(runner.method, clip, images, kinds)
-                for n in picture_frames(clip, pictures):
-                    with lock:
-                        if not has_image(clip, n, runner.method):
-                            continue
-                        _collect_picture(shown, clip, n, name, runner.method, images, kinds)
+        on_step(f"{name} on {clip.name}")
+        curves[name][clip.name] = []
+        for schedule in schedules(runner.method):
+            kinds = schedule.kinds(len(clip.numbers))
+            images = runner(clip.sequence, schedule)
+            curves[name][clip.name] += score_clip(runner.method, clip, images, kinds)
+            for n in picture_frames(clip, pictures):
+                with lock:
+                    if not has_image(clip, n, runner.method):
+                        continue
+                    _collect_picture(shown, clip, n, name, runner.method, images, kinds)
 
     lock = threading.Lock()
     with ThreadPoolExecutor(2) as pool:  # most of the time is compilation, which two threads do side by side
-        list(pool.map(run_method, runners))
+        for index in range(len(clips)):  # not over the clips themselves: one would be held while the next is read
+            list(pool.map(functools.partial(run_method, clip=clips[index]), runners))
     return {
         "rows": _summarise(curves),
         "curves": curves,
@@ -226,9 +272,10 @@ def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, image
         key = (clip.name, n, kind, resolution)
         if key not in shown:
             shown[key] = _new_picture(clip, n, kind, low)
-        shown[key]["images"][name] = images[n]
+        # Copies: views would keep all frames of all clips in memory.
+        shown[key]["images"][name] = images[n].copy()
         if n:
-            shown[key]["previous"][name] = images[n - 1]
+            shown[key]["previous"][name] = images[n - 1].copy()
 
 
 def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
@@ -242,7 +289,7 @@ def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
     }  # fmt: skip
     for part, index in inputs.items():
         color = np.repeat(np.repeat(np.asarray(rendered[max(index, 0)]), scale, 0), scale, 1)
-        picture[part] = {"input": color, "reference": np.asarray(target[n if part == "images" else max(n - 1, 0)])}
+        picture[part] = {"input": color, "reference": np.array(target[n if part == "images" else max(n - 1, 0)])}
     return picture
 
 

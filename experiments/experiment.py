@@ -21,11 +21,11 @@ from experiments import environment as machine
 from experiments.classes import QUESTIONS, class_remark, evaluate_classes
 from experiments.comparison import Trained, check_scored, make_runners, notes, table_references
 from experiments.config import Config
-from experiments.evaluate import Clip, Runner, evaluate, load_clip
+from experiments.evaluate import Clip, Clips, Runner, evaluate
 from experiments.report import print_table, write_report
 from experiments.report.classes import write_class_sheet
 from experiments.training import restore_stages, train_stages
-from experiments.variants import VARIANTS, stages_of, trained_as
+from experiments.variants import VARIANTS, compared, stages_of, trained_as
 from experiments.variants.classifier import thresholds
 
 
@@ -127,23 +127,22 @@ def run_experiment(
         seconds["training"] = round(sum(stage["seconds"] for t in trained.values() for stage in t.report.values()), 1)
 
         bar = progress.add_task("evaluate", total=None, text="reading")
-        segments = {split: dataset.segments(split) for split in ("validation", "test")}
-        clips = {
-            split: [load_clip(dataset, s, config.warmup, ranges=bool(classifiers)) for s in segments[split]]
-            for split in segments
-        }
+        methods = [VARIANTS[row].method(config) for row in compared(names)]
+        options = {"native": any(method.info.native for method in methods), "ranges": bool(classifiers)}
+        validation, clips = (Clips(dataset, split, config.warmup, **options) for split in ("validation", "test"))
         runners, settings = make_runners(
-            names, config, trained, clips["validation"], out, lambda text: progress.update(bar, text=text)
+            names, config, trained, validation, out, lambda text: progress.update(bar, text=text)
         )
+        del validation  # and the memory of what it kept
         lap("tuning")
-        progress.update(bar, total=len(runners) * len(clips["test"]), completed=0)
+        progress.update(bar, total=len(runners) * len(clips), completed=0)
         result = evaluate(
             runners,
-            clips["test"],
+            clips,
             pictures=config.pictures,
             on_step=lambda text: progress.update(bar, advance=1, text=text),
         )
-        classes = _evaluate_classes({name: runners[name] for name in classifiers}, configs, clips["test"], out)
+        classes = _evaluate_classes({name: runners[name] for name in classifiers}, configs, clips, out)
         progress.update(bar, text="done")
         lap("evaluation")
     metrics = {
@@ -161,8 +160,8 @@ def run_experiment(
     }
     if classes:
         metrics["classes"] = classes
-    references = table_references(runners, clips["test"][0].sequence.scale)
-    remarks = notes(names, dataset, clips["test"], settings, config)
+    references = table_references(runners, dataset.info.scale)
+    remarks = notes(names, dataset, [clips.outline(n) for n in range(len(clips))], settings, config)
     remarks += [class_remark(name, scores) for name, scores in classes.items()]
     page = write_report(
         out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references
@@ -234,7 +233,7 @@ def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str
 
 
 def _evaluate_classes(
-    runners: Mapping[str, Runner], configs: Mapping[str, Config], clips: list[Clip], out: Path
+    runners: Mapping[str, Runner], configs: Mapping[str, Config], clips: Sequence[Clip], out: Path
 ) -> dict[str, Any]:
     """Scores of each classifier against the automatic labels, and its maps as pictures beside the report."""
     found = {}

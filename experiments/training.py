@@ -25,11 +25,11 @@ OnStep = Callable[[str, int, float, dict[str, float]], None]
 """Called with stage, step, progress in [0, 1] and the terms."""
 
 
-def make_batches(dataset: Dataset, config: Config, stage: Stage):
+def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: int = 4):
     """An iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
 
     With ``config.fresh`` the scenes on disk are the first round, and each further one is rendered while the last is
-    trained on.
+    trained on. ``prefetch`` batches are held ready.
 
     Raises:
       ValueError: no sequence is long enough for a clip, the crop is too small, or ``fresh`` with imported data.
@@ -43,7 +43,7 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
         )
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
     length = min(config.clip, longest)
-    cut = {"length": length, "batch": stage.batch, "crop": (height, width)}
+    cut = {"length": length, "batch": stage.batch, "crop": (height, width), "prefetch": prefetch}
 
     def make(number: int):
         source = disk_source(dataset, "train", ranges=stage.ranges) if number == 0 else fresh(number)
@@ -66,7 +66,7 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage):
 def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> PyTree:
     """Fresh variables of the last stage's method, which holds those of the stages before it."""
     # Without fresh scenes: the next round would be rendered for nothing.
-    batch = next(make_batches(dataset, dataclasses.replace(config, fresh=None), stages[-1]))
+    batch = next(make_batches(dataset, dataclasses.replace(config, fresh=None), stages[-1], prefetch=1))
     example = jax.tree.map(np.asarray, select_time(batch.frames, 0))
     return stages[-1].method.init(jax.random.key(config.seed), example)
 

@@ -1,5 +1,6 @@
 """Choose the settings of the TAA family on validation frames: a baseline is only worth beating at its best."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ class Setting(NamedTuple):
     psnr: float
 
 
-def tune(variant: Variant, config: Config, clips: list[Clip]) -> Setting:
+def tune(variant: Variant, config: Config, clips: Sequence[Clip]) -> Setting:
     """For each clamp the best alpha, then for it the best sigma; returns the best of all.
 
     A clamp replaces the first one only if it gains more than the standard error of the gain over the clips: what a few
@@ -47,7 +48,7 @@ def tune(variant: Variant, config: Config, clips: list[Clip]) -> Setting:
     return chosen
 
 
-def _tune_clamp(variant: Variant, config: Config, clips: list[Clip], clamp: str) -> tuple[Setting, np.ndarray]:
+def _tune_clamp(variant: Variant, config: Config, clips: Sequence[Clip], clamp: str) -> tuple[Setting, np.ndarray]:
     method = variant.method(config, clamp=clamp)
     first, _ = _best(method, clamp, [(alpha, FIRST_SIGMA) for alpha in ALPHAS], clips)
     return _best(method, clamp, [(first.alpha, sigma) for sigma in SIGMAS], clips)
@@ -59,10 +60,11 @@ def setting_variables(setting: Setting) -> dict[str, Any]:
 
 
 def _best(
-    method: Method, clamp: str, settings: list[tuple[float, float]], clips: list[Clip]
+    method: Method, clamp: str, settings: list[tuple[float, float]], clips: Sequence[Clip]
 ) -> tuple[Setting, np.ndarray]:
     """The best of ``settings`` (alpha, sigma), and its PSNR on each clip."""
-    scores = np.array([_score_grid(method, np.array(settings, np.float32), clip) for clip in clips])
+    # By index: a loop over the clips would hold one while the next is read.
+    scores = np.array([_score_grid(method, np.array(settings, np.float32), clips[n]) for n in range(len(clips))])
     top = int(np.argmax(scores.mean(axis=0)))
     return Setting(clamp, *settings[top], float(scores[:, top].mean())), scores[:, top]
 

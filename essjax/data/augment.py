@@ -59,6 +59,43 @@ def start_with_cut(sequence: Sequence) -> Sequence:
     )
 
 
+def crop_images(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:
+    """The first half of ``crop``: only the images, as views; for ``crop_origin`` to finish.
+
+    Args:
+      sequence: NumPy leaves ``[H, W, C]``, or with a time axis; native frames are dropped.
+      top: first row, LR pixels.
+      left: first column, LR pixels.
+      height: LR pixels.
+      width: LR pixels.
+    """
+    scale = sequence.scale
+
+    def small(image: Any) -> Any:
+        return _window(image, top, left, height, width)
+
+    def enlarged(image: Any) -> Any:
+        return _window(image, scale * top, scale * left, scale * height, scale * width)
+
+    return Sequence(
+        frames=_map_images(sequence.frames, lambda _, image: small(image)),
+        reference=enlarged(sequence.reference),
+        valid=None if sequence.valid is None else small(sequence.valid),
+        steady=None if sequence.steady is None else small(sequence.steady),
+        ranges=None if sequence.ranges is None else jax.tree.map(enlarged, sequence.ranges),
+    )
+
+
+def crop_origin(sequence: Sequence, top: int, left: int) -> Sequence:
+    """The second half of ``crop``: principal point and ``valid`` of the images that ``crop_images`` cut out."""
+    frames, valid = sequence.frames, sequence.valid
+    if frames.camera is not None:
+        center = frames.camera.center - np.asarray([left, top], np.float32)
+        frames = dataclasses.replace(frames, camera=dataclasses.replace(frames.camera, center=center))
+    valid = None if valid is None else valid * _stays_inside(frames)
+    return dataclasses.replace(sequence, frames=frames, valid=valid)
+
+
 def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:
     """Cut a window out of all frames, the matching one out of reference and ranges; native frames are dropped.
 
@@ -78,26 +115,7 @@ def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Se
     rows, columns = sequence.frames.motion.shape[-3:-1]
     if not (0 <= top <= rows - height and 0 <= left <= columns - width and height > 0 and width > 0):
         raise ValueError(f"crop: {width}x{height} at ({left}, {top}) does not fit into frames of {columns}x{rows}.")
-    scale, frames = sequence.scale, sequence.frames
-    cropped = _map_images(frames, lambda _, image: _window(image, top, left, height, width))
-    camera = frames.camera
-    if camera is not None:
-        camera = dataclasses.replace(camera, center=camera.center - np.asarray([left, top], np.float32))
-    cropped = dataclasses.replace(cropped, camera=camera)
-    valid, steady = (
-        None if mask is None else _window(mask, top, left, height, width) for mask in (sequence.valid, sequence.steady)
-    )
-
-    def enlarged(image: Any) -> Any:
-        return _window(image, scale * top, scale * left, scale * height, scale * width)
-
-    return Sequence(
-        frames=cropped,
-        reference=enlarged(sequence.reference),
-        valid=None if valid is None else valid * _stays_inside(cropped),
-        steady=steady,
-        ranges=None if sequence.ranges is None else jax.tree.map(enlarged, sequence.ranges),
-    )
+    return crop_origin(crop_images(sequence, top, left, height, width), top, left)
 
 
 def _flip_camera(camera: Camera, component: int, size: int) -> Camera:

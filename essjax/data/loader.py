@@ -5,6 +5,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, Protocol
 
 import grain
@@ -12,7 +13,7 @@ import jax
 import numpy as np
 
 from essjax.data.augment import crop as crop_sequence
-from essjax.data.augment import flip, start_with_cut
+from essjax.data.augment import crop_images, crop_origin, flip, start_with_cut
 from essjax.data.layout import Dataset
 from essjax.data.memory import Kept
 from essjax.data.read import read_frame, select_records
@@ -104,17 +105,21 @@ class DiskSource:
           ValueError: a file is missing or damaged.
         """
         info = self._dataset.sequences[self._segments[index].sequence]
+        records = self._records[index][start : start + length]
 
         def read(record: Any) -> Sequence:
-            frame = self._kept.get(
-                (info.name, record["number"]),
-                lambda: read_frame(self._dataset.path, info, record, **self._options),
-            )
+            make = partial(read_frame, self._dataset.path, info, record, **self._options)
+            frame = self._kept.get((info.name, record["number"]), make)
             # Copied, so that a frame that is not kept is gone before the others are read.
-            return frame if box is None else jax.tree.map(np.array, crop_sequence(frame, *box))
+            return frame if box is None else jax.tree.map(np.array, crop_images(frame, *box))
 
-        parts = list(self._pool.map(read, self._records[index][start : start + length]))
+        kept = [self._kept.find((info.name, record["number"])) for record in records]
+        others = self._pool.map(read, [record for record, frame in zip(records, kept, strict=True) if frame is None])
+        parts = [
+            next(others) if frame is None else frame if box is None else crop_images(frame, *box) for frame in kept
+        ]
         found = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        found = found if box is None else crop_origin(found, *box[:2])
         return start_with_cut(found) if start == 0 else found
 
 

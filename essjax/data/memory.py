@@ -70,13 +70,18 @@ class Kept:
         self.size = 0
         """Bytes of the values kept."""
 
+    def find(self, key: Hashable) -> PyTree | None:
+        """The value of ``key``, or None if it is not kept."""
+        with self._lock:
+            return self._values.get(key)
+
     def get(self, key: Hashable, make: Callable[[], PyTree]) -> PyTree:
         """The value of ``key``, kept or made; two threads that ask at the same time may both make it."""
-        with self._lock:
-            if key in self._values:
-                return self._values[key]
+        value = self.find(key)
+        if value is not None:
+            return value
         value = make()
-        size = sum(leaf.nbytes for leaf in jax.tree.leaves(value))
+        size = sum(getattr(leaf, "nbytes", 0) for leaf in jax.tree.leaves(value))
         with self._lock:
             limit = free_memory() if self._limit is None else self._limit
             if key not in self._values and self.size + size <= limit:

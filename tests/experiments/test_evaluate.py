@@ -1,8 +1,17 @@
-"""The summary of an evaluation: means per sequence and over sequences."""
+"""The summary of an evaluation: means per sequence and over sequences; clips that are read one at a time."""
 
+import gc
+import weakref
+
+import jax
+import numpy as np
 import pytest
 
-from experiments.evaluate import _summarise
+from essjax import methods
+from essjax.data import write_dataset, write_sequence
+from experiments import evaluate as module
+from experiments.evaluate import Clips, Runner, _summarise, evaluate, load_clip
+from tests.helpers import make_sequence
 
 
 def _entry(kind, psnr, non_finite=0):
@@ -22,3 +31,74 @@ def test_a_frame_that_is_not_finite_leaves_no_mean_that_looks_better():
     assert rows["broken", "b", "ss"]["psnr"] == 31.0 and rows["broken", "mean", "ess"]["psnr_foreground"] == 30.0
     assert rows["sound", "mean", "ss"]["psnr_foreground"] == pytest.approx(25.0)
     assert rows["sound", "mean", "ss"]["psnr_reference"] is None  # absent, not spoiled
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("clips")
+    for number in range(3):
+        made = make_sequence(number, 4, 1, 12, 16, native=True)
+        write_sequence(root, f"s{number}", jax.tree.map(lambda leaf: np.array(leaf[:, 0]), made))
+    return write_dataset(root, {"test": ["s0", "s1", "s2"]})
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Name of each clip that is read, and how many of those read before it are still in memory then."""
+    found, alive = [], []
+
+    def read(dataset, segment, **options):
+        gc.collect()
+        found.append((segment.sequence, sum(reference() is not None for reference in alive)))
+        sequence = original(dataset, segment, **options)
+        alive.append(weakref.ref(sequence.reference))
+        return sequence
+
+    original = module.read_segment
+    monkeypatch.setattr(module, "read_segment", read)
+    return found
+
+
+def assert_same_clip(a, b):
+    assert jax.tree.structure(a.sequence) == jax.tree.structure(b.sequence)
+    jax.tree.map(np.testing.assert_array_equal, a.sequence, b.sequence)
+    np.testing.assert_array_equal(a.holes, b.holes)
+    assert (a.name, a.numbers, a.scored, a.exact_holes) == (b.name, b.numbers, b.scored, b.exact_holes)
+
+
+def test_clips_are_read_when_asked_for_and_kept_within_the_bound(dataset, reads):
+    whole = [load_clip(dataset, segment, 1) for segment in dataset.segments("test")]
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves((whole[0].sequence, whole[0].holes)))
+    reads.clear()
+    clips = Clips(dataset, "test", 1, memory=2 * size)
+    assert len(clips) == 3 and not reads
+    for clip, expected in zip(clips, whole, strict=True):
+        assert_same_clip(clip, expected)
+    list(clips)
+    assert [name for name, _ in reads] == ["s0", "s1", "s2", "s2"]
+    outlines = [clips.outline(n) for n in range(3)]
+    assert len(reads) == 4
+    for outline, expected in zip(outlines, whole, strict=True):
+        np.testing.assert_array_equal(outline.sequence.reference, expected.sequence.reference[:1])
+        assert outline.sequence.reference.base is None  # a view would hold the whole clip
+        np.testing.assert_array_equal(outline.holes, expected.holes)
+
+
+def test_native_frames_are_read_on_request(dataset):
+    assert Clips(dataset, "test", 1, native=False)[0].sequence.native is None
+    assert Clips(dataset, "test", 1)[0].sequence.native is not None
+
+
+def test_an_evaluation_holds_one_clip_and_gives_the_same_numbers(dataset, reads):
+    """The oracle: all clips in a list."""
+    runners = {"bilinear": Runner(methods.bilinear(), {})}
+    expected = evaluate(runners, [load_clip(dataset, segment, 1) for segment in dataset.segments("test")])
+    reads.clear()
+    found = evaluate(runners, Clips(dataset, "test", 1, memory=0))
+    assert [name for name, _ in reads] == ["s0", "s1", "s2"]
+    assert max(alive for _, alive in reads) == 0
+    assert found["rows"] == expected["rows"] and found["curves"] == expected["curves"]
+    assert len(found["pictures"]) == len(expected["pictures"]) > 0
+    for a, b in zip(found["pictures"], expected["pictures"], strict=True):
+        assert {k: a[k] for k in ("sequence", "frame", "kind")} == {k: b[k] for k in ("sequence", "frame", "kind")}
+        jax.tree.map(np.testing.assert_array_equal, (a["images"], a["previous"]), (b["images"], b["previous"]))
