@@ -251,7 +251,7 @@ def clips(
       flips: mirror half of the clips left-right and half top-bottom.
       seed: of shuffling, crops and flips.
       epochs: passes over all clips; None: without end.
-      threads: that prepare batches.
+      threads: that prepare batches; at most as many as are held ready.
       prefetch: batches held ready.
 
     Raises:
@@ -273,5 +273,5 @@ def clips(
         .repeat(epochs)
         .random_map(cut_out)
         .batch(batch, drop_remainder=True, batch_fn=_stack)
-        .to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=prefetch))
+        .to_iter_dataset(grain.ReadOptions(num_threads=min(threads, prefetch), prefetch_buffer_size=prefetch))
     )

@@ -253,6 +253,10 @@ def test_sequences_with_and_without_cameras_do_not_go_together(tmp_path):
         clips(disk_source(dataset, "train"), length=2, batch=1, crop=(4, 13))
 
 
+def test_one_batch_held_ready_is_no_reason_for_a_warning(caplog):
+    assert next(iter(clips([coordinates(0)], length=2, batch=1, prefetch=1))) and not caplog.records
+
+
 def test_a_cached_source_makes_each_sequence_once():
     calls = []
     source = CachedSource([lambda n=n: calls.append(n) or coordinates(n) for n in range(2)])
