@@ -29,9 +29,16 @@ def plain() -> Iterator[None]:
         _plain.reset(token)
 
 
+def backend() -> str:
+    """Where programs that are traced now will run: "cpu", "gpu", "tpu". Minds ``jax.default_device``."""
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+    platform = jax.default_backend() if device is None else getattr(device, "platform", device)
+    return "gpu" if platform in ("cuda", "rocm") else platform
+
+
 def on_gpu() -> bool:
     """Whether programs for a GPU are to be made."""
-    return jax.default_backend() == "gpu" and not _plain.get()
+    return backend() == "gpu" and not _plain.get()
 
 
 @functools.cache

@@ -67,4 +67,4 @@ def feature_l1(features_a: Sequence[Image], features_b: Sequence[Image]) -> list
 
 def sum_of_means(levels: Sequence[Image]) -> Array:
     """Mean of every level, summed: the sum over k in ExtraSS eq 8 and 13. Returns a scalar; 0 without levels."""
-    return sum((jnp.mean(level) for level in levels), start=jnp.zeros(()))
+    return sum((jnp.mean(level) for level in levels), start=jnp.zeros((), jnp.float32))

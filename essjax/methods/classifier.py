@@ -120,7 +120,7 @@ def look(frame: Frame, unit: Array, scale: int, sigma: float) -> Current:
 
 def warp_history(history: History, current: Current) -> Warped:
     """Counter, range and depth are read nearest, logits bilinearly (section 3), the image bicubically."""
-    known = inside_mask(current.motion) * (1.0 - expand_flag(history.empty, current.motion.ndim))
+    known = inside_mask(current.motion) * ~expand_flag(history.empty, current.motion.ndim)
     exact = jnp.concatenate([history.counter, history.low, history.high, history.closeness], axis=-1)
     exact = backward_warp(exact, current.motion, mode="nearest")
     there = known > 0

@@ -62,7 +62,7 @@ def _kept(color: Color, gbuffers: GBuffers) -> Kept:
 
 
 def _start(example: Frame) -> Memory:
-    black = jnp.zeros((*example.motion.shape[:-1], 3))
+    black = jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32)
     return start_memory(example, _kept(black, example.gbuffers), FRAMES)
 
 

@@ -118,7 +118,7 @@ def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: floa
     """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear)."""
     base, normal = surface_guides(gbuffers)
     base_half, normal_half = _enlarge(halve(base), base), _enlarge(halve(normal), normal)
-    distance = _length(base_half - base) / jnp.sqrt(3.0)
+    distance = _length(base_half - base) / 3.0**0.5
     similar = (1.0 - distance) * sum_channels(normal_half * normal) > delta
     large = _enlarge(refined, warped)
     norm = jnp.maximum(_length(large), 1e-3)
@@ -157,7 +157,7 @@ def _extrapolate(network: Network, variables: PyTree, pair: Memory, frame: Frame
 
 
 def _frnet_inputs(example: Frame) -> tuple[Image, Image]:
-    half = halve(jnp.zeros((*example.motion.shape[:-1], 3)))
+    half = halve(jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
     return jnp.stack([half, half]), half[..., :1]
 
 
@@ -249,7 +249,7 @@ def warp_history(history: History, frame: Frame, scale: int) -> Warped:
 
 def _prior(valid: Mask, weight: Array | float) -> Array:
     """Logit of the current sample's share before training: ``weight`` on trusted history, nearly all elsewhere."""
-    share = jnp.where(valid > 0, weight, 0.98)
+    share = jnp.where(valid > 0, weight, jnp.float32(0.98))
     return jnp.log(share) - jnp.log(1.0 - share)  # never near 1: log1p would cost more and gain nothing
 
 
@@ -307,7 +307,7 @@ def extrass(
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
     def start(example: Frame) -> History:
-        image = nearest_upsample(jnp.zeros((*example.motion.shape[:-1], 3)), scale)
+        image = nearest_upsample(jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32), scale)
         return History(
             rendered=start_pair(example),
             image=image,
@@ -330,7 +330,7 @@ def extrass(
         key_flow, key_net = jax.random.split(key)
 
         def both_inputs(example):
-            history, color = start(example), jnp.zeros((*example.motion.shape[:-1], 3))
+            history, color = start(example), jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32)
             warped = warp_history(history, example, scale)
             return [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
 

@@ -80,7 +80,8 @@ def _surfaces(gbuffers: GBuffers) -> GBuffers:
 
 def _start(example: Frame, width: int) -> History:
     size = example.motion.shape[:-1]
-    kept = Kept(color=jnp.zeros((*size, 3)), hidden=jnp.zeros((*size, width)), surfaces=_surfaces(example.gbuffers))
+    color, hidden = (jnp.zeros((*size, channels), jnp.float32) for channels in (3, width))
+    kept = Kept(color=color, hidden=hidden, surfaces=_surfaces(example.gbuffers))
     return History(
         rendered=start_memory(example, kept, 1),
         surfaces=_surfaces(example.gbuffers),
@@ -151,7 +152,8 @@ def fasset(
     def init(key, example):
         require(example, sorted(GUIDED), name)
         history, size = start(example), example.motion.shape[:-1]
-        inputs = jnp.zeros((*size, 3)), jnp.zeros((*size, 1)), _guides(history, example), jnp.zeros((*size, width))
+        color, mask, hidden = (jnp.zeros((*size, channels), jnp.float32) for channels in (3, 1, width))
+        inputs = color, mask, _guides(history, example), hidden
         return {"fasset": network.init(key, *inputs, example.jitter)}
 
     def predict(variables, history, frame, color, mask, hidden, train, task):

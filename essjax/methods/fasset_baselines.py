@@ -116,7 +116,7 @@ def extranet_plus(scale: int = 2) -> Method:
 
     def start(example: Frame) -> Memory:
         large = enlarge(example, scale, None)
-        black = jnp.zeros((*large.motion.shape[:-1], 4))
+        black = jnp.zeros((*large.motion.shape[:-1], 4), jnp.float32)
         return start_memory(large, Kept(shading=black, gbuffers=hole_buffers(large.gbuffers)), FRAMES)
 
     def init(key, example):

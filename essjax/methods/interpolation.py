@@ -147,7 +147,7 @@ def blend(first: Candidate, second: Candidate) -> Color:
     """The mean where both show the same surface, else the nearer one of those found; the mean again where none is."""
     same = _same_surface(first.nearness, second.nearness)
     both = (first.found > 0) & (second.found > 0)
-    nearer = jnp.where(first.nearness > second.nearness, 1.0, 0.0)
+    nearer = (first.nearness > second.nearness).astype(jnp.float32)
     share = jnp.where(both, jnp.where(same, 0.5, nearer), 0.5 + 0.5 * (first.found - second.found))
     return share * first.color + (1.0 - share) * second.color
 

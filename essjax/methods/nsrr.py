@@ -99,7 +99,7 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool =
         if frame.color is not None:
             return history, supersample(variables, history, frame, train)[0]
         *lead, height, wide, _ = frame.motion.shape
-        return history, Prediction(image=jnp.zeros((*lead, scale * height, scale * wide, 3)))
+        return history, Prediction(image=jnp.zeros((*lead, scale * height, scale * wide, 3), jnp.float32))
 
     info = MethodInfo("nsrr", scale=scale, predicts=frozenset({"ss"}), renders_all=not half)
     return Method(init, start, render_step, pass_step if half else refuse_extrapolation("nsrr"), info)

@@ -142,7 +142,7 @@ def _shading(frame: Frame) -> Shading:
 
 def start_pair(example: Frame) -> Memory:
     """ExtraSS's memory of nothing, with the shapes of ``example`` (whose colour may be None)."""
-    black = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3)))
+    black = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
     return start_memory(example, _shading(black), 2)
 
 

@@ -79,7 +79,7 @@ class Classifier(nn.Module):
             x = ConvNorm(self.width, 1)(x, train)
         # A small scale: the first logits are near the prior. From zero it would take the optimiser hundreds of steps.
         scale = nn.initializers.constant(LOGIT_SCALE)
-        last = batch_norm(train, scale_init=scale, bias_init=lambda *_: jnp.asarray(self.prior))
+        last = batch_norm(train, scale_init=scale, bias_init=lambda *_: jnp.asarray(self.prior, jnp.float32))
         x = conv(LOGITS, 1)(x)
         logits = last(x)
         return crop(bilinear_upsample(logits), height, width)

@@ -124,12 +124,13 @@ def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation
     sizes, strides = lhs.shape[1:3], tuple(window_strides)
     groups = options.get("feature_group_count", 1)
     depthwise = 1 < groups == lhs.shape[3] == rhs.shape[3] and strides == (1, 1)
-    simple = (groups == 1 or depthwise) and jax.default_backend() == "cpu"
+    simple = (groups == 1 or depthwise) and kernels.backend() == "cpu"
     simple &= all(d in (None, (1, 1), [1, 1]) or tuple(d) == (1, 1) for d in (lhs_dilation, rhs_dilation))
     if simple and strides[0] == strides[1] and all(size % strides[0] == 0 for size in sizes):
         pairs = lax.padtype_to_pads(sizes, rhs.shape[:2], strides, padding) if isinstance(padding, str) else padding
         pairs = tuple((int(low), int(high)) for low, high in pairs)
         if all(n - strides[0] <= low + high < n and low < n for n, (low, high) in zip(rhs.shape, pairs, strict=False)):
+            lhs, rhs = _vary_alike(lhs, rhs)
             if depthwise:
                 return _depthwise(lhs, rhs, pairs)
             return _convolve(lhs, rhs, pairs) if strides[0] == 1 else _strided(lhs, rhs, strides[0], pairs)
@@ -140,6 +141,21 @@ def scan_friendly_convolution(lhs, rhs, window_strides, padding, *, lhs_dilation
         lhs, rhs, window_strides, padding, lhs_dilation=lhs_dilation, rhs_dilation=rhs_dilation, **options
     )
     return result[..., :outputs]
+
+
+def _vary_alike(*arrays: jax.Array) -> list[jax.Array]:
+    """In ``jax.shard_map``: each array marked as varying over the mesh axes that any of them varies over.
+
+    JAX sums the gradient of what is the same everywhere (a kernel) over the devices; only not in a custom rule.
+    """
+    kinds = [jax.typeof(array) for array in arrays]
+    # Of jax before and since 0.12.
+    varying = [kind.vma if hasattr(kind, "vma") else kind.mat.varying for kind in kinds]  # type: ignore[attr-defined]
+    axes = frozenset().union(*varying)
+    return [
+        lax.pcast(array, tuple(axes - own), to="varying") if axes - own else array
+        for array, own in zip(arrays, varying, strict=True)
+    ]
 
 
 LIKED = 8

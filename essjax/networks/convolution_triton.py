@@ -44,7 +44,7 @@ def conv3x3_kernel(
       block_columns: of a tile.
       stages: of the pipeline of loads.
     """
-    item = tl.program_id(2)
+    item = tl.program_id(2).to(tl.int64)  # of large batches more numbers than int32 counts
     pixel = tl.arange(0, block_rows * block_columns)
     row = tl.program_id(1) * block_rows + pixel // block_columns
     column = tl.program_id(0) * block_columns + pixel % block_columns
@@ -72,7 +72,8 @@ def conv3x3_kernel(
         total = tl.dot(left, right, total)
     total += tl.load(bias + output)[None, :]
     total = tl.where(total > 0, total, total * slope)
-    at = (item * height + row) * width + column
+    y += item * (height * width * outputs)
+    at = row * width + column
     inside = (row < height) & (column < width)
     tl.store(
         y + at[:, None] * outputs + output[None, :],

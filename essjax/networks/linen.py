@@ -24,7 +24,7 @@ def _multiply_kernels_by_noise(key: Key, variables: PyTree) -> PyTree:
     leaves, tree = jax.tree_util.tree_flatten_with_path(variables)
     sizes = [leaf.size if path[-1].key == "kernel" else 0 for path, leaf in leaves]
     # One draw along one axis: XLA:CPU compiles seconds for each draw of an array with several axes.
-    noise = jax.random.uniform(key, (sum(sizes),), minval=-1.0)
+    noise = jax.random.uniform(key, (sum(sizes),), jnp.float32, minval=-1.0)
     drawn, start = [], 0
     for (_, leaf), size in zip(leaves, sizes, strict=True):
         drawn.append(leaf * noise[start : start + size].reshape(leaf.shape) if size else leaf)

@@ -160,20 +160,26 @@ def _select_alone(guide_previous: Array, guide: Array, motion: Array, inverse: A
     barriers too early to prevent that). A branch is a border that nothing is fused across. Its condition may not be
     batched, a batched branch would compute both sides; and it must not be known to the compiler.
     """
-    height, width = motion.shape[:2]
-    return jax.lax.cond(
-        jnp.any(jnp.isfinite(motion)),
-        lambda *arrays: _pack(_best_by_network(_keys(*arrays))),
-        lambda *arrays: _pack([jnp.full((height, width), jnp.inf)] * WINNERS),
-        guide_previous, guide, motion, inverse,
-    )  # fmt: skip
+    arrays = guide_previous, guide, motion, inverse
+    return jax.lax.cond(jnp.any(jnp.isfinite(motion)), _select_some, _select_nothing, *arrays)
+
+
+# Functions of the module, not lambdas: called eagerly, ``cond`` compiles new ones again.
+def _select_some(*arrays: Array) -> Array:
+    return _pack(_best_by_network(_keys(*arrays)))
+
+
+def _select_nothing(*arrays: Array) -> Array:
+    """The constant for no winner, plus a zero that varies where the arrays do, as shard_map wants of both branches."""
+    zero = sum(jnp.max(array).astype(jnp.int32) for array in arrays) * 0
+    return _pack([jnp.full(arrays[2].shape[:2], jnp.inf, jnp.float32)] * WINNERS) + zero
 
 
 def _select(implementation: str, *arrays: Array) -> Array:
     """Packed numbers of the four best candidates, ``[H, W]``; arguments of ``_keys``."""
     if implementation == "reference":
         return _pack(_best_by_sorting(_keys(*arrays)))
-    if jax.default_backend() == "cpu":
+    if kernels.backend() == "cpu":
         return _select_alone(*arrays)
     return jax.lax.optimization_barrier(_pack(_best_by_network(_keys(*arrays))))
 
@@ -189,9 +195,10 @@ def _weigh(
     # Number by number: gathers of rows would be written out, these fuse.
     apart = [guide[..., k] - gather_pixels(flat, pixel * channels + k) for k in range(channels)]
     x, y = _coordinates(motion)
-    squares = [inverse[k] * d * d for k, d in enumerate([*apart, x - column - 0.5, y - row - 0.5])]
+    apart = [jnp.where(usable, d, 0.0) for d in (*apart, x - column - 0.5, y - row - 0.5)]  # else NaN times 0 is NaN
+    squares = [inverse[k] * d * d for k, d in enumerate(apart)]
     # With all 33 unusable the first takes everything. A constant replaces the cost, so no gradient passes.
-    unusable = jnp.where(rank == 0, 0.0, -jnp.inf)
+    unusable = jnp.where(rank == 0, jnp.float32(0.0), -jnp.inf)
     logits = jnp.where(usable, -0.5 * jnp.asarray(sum(squares)), unusable)
     # A softmax term by term: a reduction over four planes is slow on XLA:CPU.
     top = jax.lax.stop_gradient(functools.reduce(_larger, logits))
@@ -214,17 +221,7 @@ def _blend(packed: Array, radiance: Array, *arrays: Array) -> Array:
 
 
 @jax.custom_jvp
-def _warp_by_kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> Array:
-    return _kernel(radiance, guide_previous, guide, motion, inverse)[0]
-
-
-@_warp_by_kernel.defjvp
-def _derivative(primals, tangents):
-    image, packed = _kernel(*primals)
-    return image, jax.jvp(functools.partial(_blend, packed), primals, tangents)[1]
-
-
-def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> list[Array]:
+def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> tuple[Array, Array]:
     """The Triton kernel on one image: the warped image, and which candidates won (as ``_select``)."""
     from essjax.warp.gbuffer_guided_triton import guided  # an optional package
 
@@ -233,7 +230,15 @@ def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array,
     planes += [jnp.zeros_like(planes[0])] * (len(planes) % 2)
     pairs = jnp.stack([jnp.stack(planes[k : k + 2], axis=-1) for k in range(0, len(planes), 2)])
     planes = jnp.pad(pairs, [(0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)], constant_values=BORDER)
-    return [array[0] for array in guided(*(array[None] for array in (radiance, planes, guide, motion, scale)))]
+    image, packed = guided(*(array[None] for array in (radiance, planes, guide, motion, scale)))
+    return image[0], packed[0]
+
+
+@_kernel.defjvp
+def _derivative(primals, tangents):
+    image, packed = _kernel(*primals)  # by this rule again where derivatives are differentiated
+    tangent = jax.jvp(functools.partial(_blend, packed), primals, tangents)[1]
+    return (image, packed), (tangent, np.zeros(packed.shape, jax.dtypes.float0))
 
 
 def _chosen(implementation: str, known: tuple[str, ...] = IMPLEMENTATIONS) -> str:
@@ -247,7 +252,7 @@ def _chosen(implementation: str, known: tuple[str, ...] = IMPLEMENTATIONS) -> st
     if implementation == "triton" and not kernels.available():
         raise ValueError(
             f"implementation: 'triton' needs a GPU and the package jax-triton, and JAX runs on "
-            f"{jax.default_backend()}. Install essjax[gpu], or leave the choice to 'auto'."
+            f"{kernels.backend()}. Install essjax[gpu], or leave the choice to 'auto'."
         )
     return ("triton" if kernels.available() else "network") if implementation == "auto" else implementation
 
@@ -318,7 +323,7 @@ def gbuffer_guided_warp(
 
     def warp(radiance, *arrays):
         if chosen == "triton":
-            return _warp_by_kernel(radiance, *arrays)
+            return _kernel(radiance, *arrays)[0]
         return _blend(_select(chosen, *jax.lax.stop_gradient(arrays)), radiance, *arrays)
 
     return _run(warp, (radiance,), guide_previous, guide, motion, sigma_guide, sigma_distance)

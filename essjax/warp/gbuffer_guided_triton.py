@@ -110,7 +110,7 @@ def guided_kernel(
     """
     stride: tl.constexpr = width + 2 * margin
     plane: tl.constexpr = stride * (height + 2 * margin)
-    item = tl.program_id(2)
+    item = tl.program_id(2).to(tl.int64)  # of large batches more numbers than int32 counts
     # What sticks out of the image repeats its last row and column: no masks.
     row = tl.minimum(tl.program_id(1) * block_rows + tl.arange(0, block_rows), height - 1)[:, None]
     column = tl.minimum(tl.program_id(0) * block_columns + tl.arange(0, block_columns), width - 1)[None, :]
@@ -192,13 +192,14 @@ def guided_kernel(
         winner_column = tl.minimum(tl.maximum(center_column + across, 0), width - 1)
         winner_row = tl.minimum(tl.maximum(center_row + down, 0), height - 1)
         winners = winners + (winner_row * width + winner_column,)
-    at = item * (height * width) + pixel
+    image += item * (height * width * depth)
+    packed += item * (height * width)
     for k in tl.static_range(depth):
         value = tl.zeros_like(total)
         for rank in tl.static_range(4):
             value += (weights[rank] / total) * tl.load(radiance + winners[rank] * depth + k).to(tl.float32)
-        tl.store(image + at * depth + k, value)
-    tl.store(packed + at, together)
+        tl.store(image + pixel * depth + k, value)
+    tl.store(packed + pixel, together)
 
 
 def constants(radiance: Any, guide: Any, shared: tuple[bool, ...]) -> dict[str, Any]:

@@ -46,7 +46,7 @@ def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
 def _agreement(a: Array | None, b: Array | None) -> Array:
     """Cosine between two normals; 1 where one of them is missing (no buffer, zero vector)."""
     if a is None or b is None:
-        return jnp.ones(())
+        return jnp.ones((), jnp.float32)
     lengths = jnp.sqrt(sum_channels(a * a) * sum_channels(b * b))
     return jnp.where(lengths > 1e-6, sum_channels(a * b) / jnp.maximum(lengths, 1e-6), 1.0)
 

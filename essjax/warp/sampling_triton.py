@@ -28,10 +28,12 @@ def _outer(d, a: tl.constexpr):
 @triton.jit
 def _taps(position, size: tl.constexpr, step: tl.constexpr, a: tl.constexpr, zeros: tl.constexpr):
     """Indices, times ``step``, and weights of the four pixels along one axis."""
-    x = tl.minimum(tl.maximum(position, -3.0), size + 3.0) - 0.5
+    # A position that is not a number reads what is not a number, as XLA does.
+    x = tl.maximum(position, -3.0, propagate_nan=tl.PropagateNan.ALL)
+    x = tl.minimum(x, size + 3.0, propagate_nan=tl.PropagateNan.ALL) - 0.5
     first = tl.floor(x)
     t = x - first
-    index = first.to(tl.int32) - 1
+    index = tl.where(first == first, first, 0.0).to(tl.int32) - 1
     weights = (_outer(1.0 + t, a), _inner(t, a), _inner(1.0 - t, a), _outer(2.0 - t, a))
     indices = ()
     kept = ()
@@ -65,13 +67,14 @@ def cubic_kernel(
       zeros: read 0 outside, not the border.
       block: numbers of one program.
     """
-    item = tl.program_id(1)
+    item = tl.program_id(1).to(tl.int64)  # of large batches more numbers than int32 counts
     number = tl.minimum(tl.program_id(0) * block + tl.arange(0, block), count * channels - 1)
     place, channel = number // channels, number % channels
     if not shared[0]:
         image += item * (height * width * channels)
     if not shared[1]:
         positions += item * (2 * count)
+    result += item * (count * channels)
     columns, column_weights = _taps(tl.load(positions + 2 * place), width, channels, a, zeros)
     rows, row_weights = _taps(tl.load(positions + 2 * place + 1), height, 1, a, zeros)
     total = tl.zeros_like(row_weights[0])
@@ -80,7 +83,7 @@ def cubic_kernel(
         for column in tl.static_range(4):
             value = tl.load(image + (first + columns[column])).to(tl.float32)
             total += value * (row_weights[row] * column_weights[column])
-    tl.store(result + item * (count * channels) + number, total)
+    tl.store(result + number, total)
 
 
 def read_cubic(image: Array, positions: Array, *, a: float, zeros: bool) -> Array:

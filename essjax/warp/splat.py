@@ -82,7 +82,7 @@ def _splat_nearest_one(image: Array, depth: Array, motion: Array) -> tuple[Array
     inside = jnp.all((target >= 0) & (target < jnp.array([width, height])), axis=-1) & ~jnp.isnan(depth)
     cell = jnp.where(inside[:, None], jnp.floor(target), 0.0).astype(jnp.int32)
     index = jnp.where(inside, cell[:, 1] * width + cell[:, 0], count)  # outside: past the end, dropped
-    nearest = jnp.full(count, jnp.inf).at[index].min(depth, mode="drop")
+    nearest = jnp.full(count, jnp.inf, jnp.float32).at[index].min(depth, mode="drop")
     wins = inside & (depth == nearest.at[index].get(mode="clip"))
     # A second minimum, over pixel numbers, makes the winner the same on every backend where depths tie.
     winner = (

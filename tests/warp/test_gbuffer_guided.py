@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from essjax.frames import GBuffers
 from essjax.warp import candidate_offsets, gbuffer_guided_warp, guided_weights, guides
+from experiments.benchmark.measure import Compilations
 
 H, W, G = 13, 18, 6
 FEW = settings(max_examples=8, deadline=None)
@@ -267,6 +268,31 @@ def test_motion_without_a_finite_number_leaves_the_border_pixel_rule():
     nowhere = np.full((H, W, 2), np.inf, np.float32)
     got = warp(radiance, guide_previous, guide, nowhere)
     np.testing.assert_array_equal(got, np.broadcast_to(radiance[-1, -1], (H, W, 3)))
+
+
+@pytest.mark.parametrize("argument", ["guide", "guide_previous", "motion"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_gradients_are_finite_where_a_pixel_is_not(argument, value):
+    """What matches nothing takes no part in the weights, nor in the gradients of all that does."""
+    arrays = dict(zip(("radiance", "guide_previous", "guide", "motion"), map(np.array, scene(7)), strict=True))
+    arrays[argument][4, 5] = value
+
+    @jax.jit
+    def gradients(sigma, arrays):
+        return jax.grad(lambda sigma, arrays: jnp.sum(gbuffer_guided_warp(**arrays, sigma_guide=sigma) ** 2), (0, 1))(
+            sigma, arrays
+        )
+
+    for leaf in jax.tree.leaves(gradients(0.3, arrays)):
+        assert np.isfinite(leaf).all()
+
+
+def test_called_eagerly_it_compiles_once():
+    arrays = scene(8)
+    gbuffer_guided_warp(*arrays)
+    with Compilations() as again:
+        gbuffer_guided_warp(*arrays)
+    assert again.count == 0
 
 
 def test_540p_fits_in_20_megabytes():

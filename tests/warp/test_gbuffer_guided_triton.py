@@ -75,6 +75,21 @@ def test_derivatives_are_the_networks():
     np.testing.assert_allclose(*tangents, rtol=1e-4)
 
 
+def test_second_derivatives_are_the_networks():
+    """The kernel is called where derivatives are differentiated, too: it has none of its own."""
+    radiance, previous, guide, motion = arrays(seed=5)
+
+    def of_sigma(sigma, implementation):
+        warped = gbuffer_guided_warp(
+            radiance, previous, guide, motion, sigma_guide=sigma, implementation=implementation
+        )
+        return jnp.sum(warped**2)
+
+    kernel, network = (jax.grad(jax.grad(of_sigma))(0.3, name) for name in ("triton", "network"))
+    assert abs(network) > 1
+    np.testing.assert_allclose(kernel, network, rtol=1e-3)
+
+
 def test_auto_takes_the_kernel():
     arguments = arrays(seed=3)
     automatic = gbuffer_guided_warp(*arguments)

@@ -87,3 +87,13 @@ def test_a_batch_of_one_is_shared():
     np.testing.assert_array_equal(result, several + 1)
     assert jax.vmap(function, (None, 0))(jnp.ones((4, 2)), several)[0].shape == (3, 4, 2)
     assert seen[-1] == ((12, 2), (12, 2))
+
+
+@pytest.mark.parametrize("outside", ["border", "zeros"])
+def test_positions_that_are_not_numbers(monkeypatch, outside):
+    """Read what is no number, as XLA's program does: bad motion must show on every backend."""
+    image, positions = inputs()
+    positions[2, 3], positions[4, 5, 1], positions[1, 1] = np.nan, np.nan, np.inf
+    taps, kernel = both(monkeypatch, lambda *arrays: sample(*arrays, mode="bicubic", outside=outside), image, positions)
+    assert np.isnan(taps).any(axis=-1).sum() == 2
+    np.testing.assert_allclose(kernel, taps, atol=1e-5)
