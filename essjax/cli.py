@@ -127,6 +127,7 @@ _COUNTS = {
     "negative": ("negative colour values", "set to 0"),
     "infinite": ("infinite colour values", "clamped"),
     "clamped": ("values beyond half's range", "clamped"),
+    "outside": ("buffer values outside [0, 1]", "clipped"),
 }
 
 

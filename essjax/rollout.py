@@ -117,59 +117,64 @@ def unroll(
         history, prediction = (jax.checkpoint(step) if remat else step)(variables, history, frame)
         return history, (prediction.image, keep(prediction.aux), prediction.state)
 
-    outputs: list[tuple[int, tuple]] = []  # (frame, output); scanned ones are added below
-    for n in range(min(schedule.lead, length)):
-        history, output = run(history, select_time(frames, n), kinds[n])
-        outputs.append((n, output))
+    def run_all(history, frames, kinds):
+        outputs = []
+        for n, kind in enumerate(kinds):
+            history, output = run(history, select_time(frames, n), kind)
+            outputs.append(output)
+        return history, _collect(outputs, kinds)
 
+    # The scan stacks what a period collected, so the size of the program does not depend on the number of frames.
+    lead, body, rest = (
+        jax.tree.map(lambda leaf, part=part: leaf[part], frames)
+        for part in (slice(schedule.lead), slice(schedule.lead, body_end), slice(body_end, None))
+    )
+    history, collected = run_all(history, lead, kinds[: schedule.lead])
+    parts = [collected]
     if pairs:
+        body = jax.tree.map(lambda leaf: leaf.reshape(pairs, schedule.period, *leaf.shape[1:]), body)
         body_kinds = kinds[schedule.lead : schedule.lead + schedule.period]
-        body = jax.tree.map(
-            lambda leaf: leaf[schedule.lead : body_end].reshape(pairs, schedule.period, *leaf.shape[1:]), frames
-        )
+        history, collected = jax.lax.scan(lambda history, chunk: run_all(history, chunk, body_kinds), history, body)
+        parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), collected))
+    history, collected = run_all(history, rest, kinds[body_end:])
+    joined = _join([*parts, collected])
 
-        def scan_body(history, chunk):
-            results = []
-            for k, kind in enumerate(body_kinds):
-                history, output = run(history, select_time(chunk, k), kind)
-                results.append(output)
-            return history, tuple(results)
-
-        history, stacked = jax.lax.scan(scan_body, history, body)
-        for pair in range(pairs):
-            for k in range(schedule.period):
-                outputs.append((schedule.lead + pair * schedule.period + k, select_time(stacked[k], pair)))
-
-    for n in range(body_end, length):
-        history, output = run(history, select_time(frames, n), kinds[n])
-        outputs.append((n, output))
-
-    return _collect(method, outputs, kinds, history)
-
-
-def _stack(trees: list[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
-
-
-def _collect(method: Method, outputs: list, kinds: tuple[str, ...], history: PyTree) -> Rollout:
-    images = jnp.stack([image for _, (image, _, _) in outputs])
-    if method.info.latency:  # step n shows frame n - latency; the last frames repeat the last image
-        shift = method.info.latency
+    images, shift = joined["image"][""], method.info.latency
+    if shift:  # step n shows frame n - latency; the last frames repeat the last image
         images = jnp.concatenate([images[shift:], jnp.repeat(images[-1:], shift, axis=0)])
-    aux = {}
-    for kind in (SS, ESS):
-        chosen = [kept for n, (_, kept, _) in outputs if kinds[n] == kind]
-        if chosen:
-            aux[kind] = _stack(chosen)
-    states = [state for _, (_, _, state) in outputs]
-    return Rollout(image=images, aux=aux, history=history, state=_mean_state(states))
+    # Each step started from the same old statistics, so their mean has seen every step alike.
+    state = jax.tree.map(lambda leaf: leaf.mean(axis=0), joined["state"])
+    return Rollout(image=images, aux=joined["aux"], history=history, state=state)
 
 
-def _mean_state(states: list[dict[str, PyTree]]) -> dict[str, PyTree]:
-    """Statistics by entry: each step started from the same old ones, so their mean has seen every step alike."""
-    names = dict.fromkeys(name for state in states for name in state)
-    found = {name: [state[name] for state in states if name in state] for name in names}
-    return {name: jax.tree.map(lambda *leaves: sum(leaves) / len(leaves), *trees) for name, trees in found.items()}
+Collected = dict[str, dict[str, PyTree]]
+"""What frames that follow each other gave, leaves ``[frames, ...]``: "image" -> "" -> images, "aux" -> kind -> what was
+kept, "state" -> entry -> statistics."""
+
+
+def _collect(outputs: list[tuple], kinds: tuple[str, ...]) -> Collected:
+    found: dict[str, dict[str, list]] = {"image": {}, "aux": {}, "state": {}}
+    for kind, (image, kept, state) in zip(kinds, outputs, strict=True):
+        for part, entries in (("image", {"": image}), ("aux", {kind: kept}), ("state", state)):
+            for name, value in entries.items():
+                found[part].setdefault(name, []).append(value)
+    return {
+        part: {name: jax.tree.map(lambda *leaves: jnp.stack(leaves), *values) for name, values in entries.items()}
+        for part, entries in found.items()
+    }
+
+
+def _join(parts: list[Collected]) -> Collected:
+    """Parts behind each other; not all have frames of every kind."""
+    return {
+        what: {
+            name: jax.tree.map(
+                lambda *leaves: jnp.concatenate(leaves), *(p[what][name] for p in parts if name in p[what])
+            )
+            for name in dict.fromkeys(name for part in parts for name in part[what])
+        }
+        for what in ("image", "aux", "state")
+    }
 
 
 def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:

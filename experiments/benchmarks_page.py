@@ -93,7 +93,9 @@ def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row = dict(first)
         for column in COLUMNS:
             values = [table[key].get(column) for table in tables if key in table]
-            if len(values) > 1 and all(value is not None for value in values):
+            if any(value is None for value in values):  # one run's frames were not all finite: neither is the mean
+                row[column] = None
+            elif len(values) > 1:
                 row[column] = sum(values) / len(values)
                 row[f"{column}_range"] = (max(values) - min(values)) / 2
         merged.append(row)

@@ -65,7 +65,7 @@ def _best(
     """The best of ``settings`` (alpha, sigma), and its PSNR on each clip."""
     # By index: a loop over the clips would hold one while the next is read.
     scores = np.array([_score_grid(method, np.array(settings, np.float32), clips[n]) for n in range(len(clips))])
-    top = int(np.argmax(scores.mean(axis=0)))
+    top = int(np.argmax(np.nan_to_num(scores.mean(axis=0), nan=-np.inf)))  # argmax takes a NaN for the largest
     return Setting(clamp, *settings[top], float(scores[:, top].mean())), scores[:, top]
 
 

@@ -38,8 +38,9 @@ class ImportReport:
     Attributes:
       dataset: the dataset that was written.
       totals: counts over all frames: ``pixels`` (LR), ``background`` pixels, ``negative`` colour values set to 0,
-        ``clamped`` values beyond half's range; ``mixed`` silhouette pixels of static objects whose motion was taken
-        from the cameras (blender); ``unwritten`` pixels likewise (unreal); ``infinite`` colour values.
+        ``clamped`` values beyond half's range; ``outside`` values of buffers in [0, 1], clipped; ``mixed`` silhouette
+        pixels of static objects whose motion was taken from the cameras (blender); ``unwritten`` pixels likewise
+        (unreal); ``infinite`` colour values.
       skipped: sequence -> broken frame -> what is wrong with it, or first frame of a gap -> which frames are missing.
       imported: the sequences of this import; the dataset may hold others, imported before.
     """
