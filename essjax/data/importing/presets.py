@@ -167,8 +167,8 @@ def _gaps(name: str, numbers: Sequence[int], skip_broken: bool) -> dict[int, str
         )
     if gaps and not skip_broken:
         raise ValueError(
-            f"sequence {name}: {next(iter(gaps.values()))}, and {len(gaps) - 1} more gaps follow. Render or copy "
-            "what is missing; --skip-broken goes on without, with a cut behind each gap."
+            f"sequence {name}: {next(iter(gaps.values()))} (gaps in all: {len(gaps)}). Render or copy what is missing; "
+            "--skip-broken goes on without, with a cut behind each gap."
         )
     return gaps
 
