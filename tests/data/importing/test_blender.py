@@ -238,9 +238,7 @@ def test_an_interrupted_import_resumes_to_the_same_report(dump, tmp_path):
 
 def test_a_gap_in_the_numbers_is_a_cut(tmp_path):
     folder = write_dump(tmp_path / "clip", numbers=[8, 9, 12, 13])
-    with pytest.raises(
-        ValueError, match=r"sequence clip: the frames 10\.\.11 are missing \(gaps in all: 1\)\. Render"
-    ):
+    with pytest.raises(ValueError, match=r"sequence clip: the frames 10\.\.11 are missing \(gaps in all: 1\)\. Render"):
         import_dataset(folder, tmp_path / "out", "blender")
     assert not (tmp_path / "out").exists()
     report = import_dataset(folder, tmp_path / "out", "blender", skip_broken=True)
