@@ -13,7 +13,7 @@ from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.typing import PyTree
 from experiments.config import Config
-from experiments.evaluate import Clip, Clips, Runner
+from experiments.evaluate import Clip, Clips, Runner, scored_frames
 from experiments.tuning import Setting, setting_variables, tune
 from experiments.variants import VARIANTS, compared, stages_of, trained_as
 
@@ -51,12 +51,8 @@ def check_scored(dataset: Dataset, config: Config) -> None:
 def _has_scored(dataset: Dataset, segment: Segment, config: Config) -> bool:
     """What ``load_clip`` will find, without reading an image."""
     cuts = {record["number"]: record["cut"] for record in dataset.sequences[segment.sequence].frames}
-    since_cut = -1
-    for number, counts in zip(dataset.numbers(segment), dataset.scored(segment), strict=True):
-        since_cut = 0 if cuts[number] else since_cut + 1
-        if counts and since_cut >= config.warmup:
-            return True
-    return False
+    numbers = dataset.numbers(segment)
+    return bool(scored_frames([cuts[n] for n in numbers], dataset.scored(segment), config.warmup))
 
 
 def make_runners(

@@ -49,14 +49,26 @@ class Clip:
     exact_holes: bool
 
 
+def scored_frames(cuts: Iterable[Any], counts: Iterable[Any], warmup: int) -> list[int]:
+    """Indices of the frames that are scored.
+
+    Args:
+      cuts: of each frame, whether it is one; the first always is.
+      counts: of each frame, whether it may be scored (``Dataset.scored``).
+      warmup: frames that are not, from a cut on.
+    """
+    since_cut, scored = 0, []
+    for n, (cut, counted) in enumerate(zip(cuts, counts, strict=True)):
+        since_cut = 0 if cut or n == 0 else since_cut + 1
+        if counted and since_cut >= warmup:
+            scored.append(n)
+    return scored
+
+
 def load_clip(dataset: Dataset, segment: Segment, warmup: int, *, native: bool = True, ranges: bool = False) -> Clip:
     """Read a test segment; the first ``warmup`` frames and as many after each cut are not scored."""
     sequence = read_segment(dataset, segment, native=native, ranges=ranges)
-    since_cut, scored = 0, []
-    for n, (cut, counts) in enumerate(zip(np.asarray(sequence.frames.cut), dataset.scored(segment), strict=True)):
-        since_cut = 0 if cut or n == 0 else since_cut + 1
-        if counts and since_cut >= warmup:
-            scored.append(n)
+    scored = scored_frames(np.asarray(sequence.frames.cut), dataset.scored(segment), warmup)
     holes = 1.0 - np.asarray(_estimated_valid(sequence.frames) if sequence.valid is None else sequence.valid)
     return Clip(segment.sequence, sequence, dataset.numbers(segment), scored, holes, sequence.valid is not None)
 

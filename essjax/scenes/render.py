@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax import kernels
 from essjax.scenes import geometry
 from essjax.scenes.jitter import reference_samples
 from essjax.scenes.materials import Surface, surface
@@ -166,7 +167,7 @@ def screen_grid(width: int, height: int, offset: np.ndarray) -> tuple[np.ndarray
 
 def chunk_size() -> int:
     """Rays per jitted call on the default backend."""
-    return CPU_CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
+    return CPU_CHUNK if kernels.backend() == "cpu" else ACCELERATOR_CHUNK
 
 
 @functools.cache
@@ -199,12 +200,12 @@ def in_tiles(
       samples: per pixel.
     """
     size = max(1, rays // samples)
-    if jax.default_backend() != "cpu":  # calls alike, but no small image padded to a chunk that is made for large ones
+    if kernels.backend() != "cpu":  # calls alike, but no small image padded to a chunk that is made for large ones
         size = -(-width * height // -(-width * height // size))
     order = tile_order(width, height, max(1, int(size**0.5)))
     pieces = -(-order.size // size)
     padded = np.pad(order, (0, pieces * size - order.size), mode="edge").reshape(pieces, size)
-    if jax.default_backend() == "cpu":
+    if kernels.backend() == "cpu":
         run = lambda part: jax.device_get(function(x[part], y[part]))
         results = [run(padded[0])]  # alone: threads that meet an uncompiled function would each compile it
         results += _threads().map(run, padded[1:])

@@ -8,6 +8,15 @@ from essjax.data import read_sequence
 from tests.helpers import make_sequence
 
 W, H = 24, 14
+OUR_RULES = """
+[motion]
+sign = "previous-current"
+y = "down"
+unit = "pixels"
+[depth]
+kind = "linear"
+"""
+"""Of a recipe for a dump that keeps to our conventions."""
 
 
 def truth(T=4, seed=0, scale=2, W=W, H=H):

@@ -9,7 +9,7 @@ import pytest
 
 from essjax.data import exr, import_dataset, read_dataset, read_sequence
 from essjax.data.importing.stream import write_clip
-from tests.data.importing.dumps import rgb, truth, write
+from tests.data.importing.dumps import OUR_RULES, rgb, truth, write
 from tests.data.importing.test_blender import FIRST, LAST, write_dump
 from tests.data.importing.test_presets import write_extranet
 from tests.data.importing.test_stream import FakeClip
@@ -24,15 +24,10 @@ color = ["R", "G", "B"]
 depth = ["Z"]
 motion = ["X", "Y"]
 reference = ["R", "G", "B"]
-[motion]
-sign = "previous-current"
-y = "down"
-unit = "pixels"
-[depth]
-kind = "linear"
 [jitter]
 source = "metadata"
 """
+RECIPE += OUR_RULES
 
 
 def write_shot(folder, known, numbers=None, files=("beauty", "final")):
@@ -45,6 +40,17 @@ def write_shot(folder, known, numbers=None, files=("beauty", "final")):
         write(folder / f"{files[1]}.{n:04d}.exr", rgb(known.reference[t]))
     jitters = {str(n): {"jitter": frames.jitter[t].tolist()} for t, n in enumerate(numbers)}
     (folder / "shot.json").write_text(json.dumps({"frames": jitters}))
+
+
+def interrupt(run, after):
+    """An import that is interrupted after so many frames."""
+
+    def stop(done, total):
+        if done == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(on_frame=stop)
 
 
 @pytest.fixture
@@ -115,12 +121,7 @@ def test_an_interrupted_import_does_not_go_on_with_another_recipe_or_dump(tmp_pa
     write_shot(tmp_path / "dump" / "shot", truth(T=6))
     write_shot(tmp_path / "other" / "shot", truth(T=6, seed=1))
 
-    def stop(done, total):
-        if done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(on_frame=stop)
+    interrupt(run, 3)
     with pytest.raises(ValueError, match=r"\(motion\.y: asked 'up', found 'down'\)"):
         run(recipe=[('y = "down"', 'y = "up"')])
     with pytest.raises(ValueError, match=r"\(folder: asked '.*/other', found '.*/dump'\)"):
@@ -200,12 +201,7 @@ def test_a_clip_that_grows_in_a_dataset_may_be_interrupted(tmp_path, run):
     for path in tmp_path.glob("*.exr"):
         path.rename(shot / path.name)
 
-    def stop(done, total):
-        if done == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(on_frame=stop)
+    interrupt(run, 5)
     with pytest.raises(ValueError, match=r"sequence shot is unfinished \(5 frames so far\)\. Run the command that"):
         read_dataset(tmp_path / "out")
     report = run()

@@ -11,7 +11,7 @@ import pytest
 from essjax.data import import_dataset
 from essjax.data.importing.recipe import load_recipe, make_recipe
 from essjax.frames import validate_sequence
-from tests.data.importing.dumps import H, W, assert_like, imported, rgb, truth, write
+from tests.data.importing.dumps import OUR_RULES, H, W, assert_like, imported, rgb, truth, write
 
 ODD = """
 optional = ["roughness", "metallic"]
@@ -136,17 +136,12 @@ frame = "{frame}.exr"
 color = ["R", "G", "B"]
 depth = ["Z"]
 motion = ["X", "Y"]
-[motion]
-sign = "previous-current"
-y = "down"
-unit = "pixels"
-[depth]
-kind = "linear"
 [jitter]
 source = "halton"
 length = 3
 first = 2
 """
+    recipe += OUR_RULES
     (tmp_path / "my.toml").write_text(recipe)
     known = truth(T=3, scale=1)
     for t in range(3):

@@ -11,7 +11,7 @@ from essjax.data import import_dataset
 from essjax.data.importing.facts import FrameFacts, generic_facts
 from essjax.data.importing.images import buffer, radiance, read_images, view_depth
 from essjax.data.importing.recipe import ScaleRule, make_recipe
-from tests.data.importing.dumps import H, W, imported, rgb, truth, write
+from tests.data.importing.dumps import OUR_RULES, H, W, imported, rgb, truth, write
 
 RECIPE = """
 [files]
@@ -23,13 +23,8 @@ motion = ["X", "Y"]
 base_color = ["albedo.R", "albedo.G", "albedo.B"]
 normal = ["N.X", "N.Y", "N.Z"]
 roughness = ["rough"]
-[motion]
-sign = "previous-current"
-y = "down"
-unit = "pixels"
-[depth]
-kind = "linear"
 """
+RECIPE += OUR_RULES
 NOWHERE = np.zeros(2, np.float32)
 
 
