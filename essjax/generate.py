@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
-from essjax.scenes import FAMILIES, families_of, make_scene, render_frame, render_sequence, split_scenes
+from essjax.scenes import EXTRA_FAMILIES, FAMILIES, families_of, make_scene, render_frame, render_sequence, split_seeds
 
 RENDERER = "essjax.scenes 2"
 """How datasets of the built-in renderer name it; the number grows when the same seed gives another picture."""
@@ -51,21 +51,23 @@ def plan(
       sequences: per family.
       frames: per sequence.
       spp: samples per pixel of the references.
-      families: only these; None: all families of the split.
+      families: only these, in the test split also ``scenes.EXTRA_FAMILIES``; None: all families of the split.
       start: skip this many seeds of the split.
 
     Raises:
       ValueError: unknown split or family, or nothing to render.
     """
-    allowed = families_of(split)
-    chosen = tuple(allowed if families is None else families)
+    usual = families_of(split)
+    allowed = usual + (EXTRA_FAMILIES if split == "test" else ())
+    chosen = tuple(usual if families is None else families)
     for family in chosen:
         if family not in allowed:
-            hint = f" ({family} is in the test split only)" if family in FAMILIES else ""
+            hint = f" ({family} is in the test split only)" if family in FAMILIES + EXTRA_FAMILIES else ""
             raise ValueError(f"families: {split} has {', '.join(allowed)}; got {family!r}{hint}.")
     clips = [
         Clip(split, family, seed, frames, spp)
-        for family, seed in split_scenes(split, sequences, start=start)
+        for seed in split_seeds(split, sequences, start=start)
+        for family in allowed
         if family in chosen
     ]
     if not clips:

@@ -47,12 +47,16 @@ def test_plan_covers_the_families_of_a_split_with_seeds_of_its_own():
     seeds = [{(c.family, c.seed) for c in clips_of} for clips_of in (train, validation, test)]
     assert not (seeds[0] & seeds[1] or seeds[0] & seeds[2] or seeds[1] & seeds[2])
     assert plan("train", 1, 8, families=["gloss"], spp=4) == [Clip("train", "gloss", train[0].seed, 8, 4)]
+    (rigging,) = plan("test", 1, 8, families=["rigging"])  # in no split, but at its seeds when asked for
+    assert rigging.seed == test[0].seed and rigging.name == f"test-rigging-{rigging.seed:04d}"
     assert {c.seed for c in plan("train", 1, 8, start=1)} == {c.seed for c in train} - {train[0].seed}
 
 
 def test_plan_errors():
     with pytest.raises(ValueError, match=r"families: train has corridor, .*; got 'plaza' .plaza is in the test split"):
         plan("train", 1, 8, families=["plaza"])
+    with pytest.raises(ValueError, match=r"got 'rigging' .rigging is in the test split only"):
+        plan("validation", 1, 8, families=["rigging"])
     with pytest.raises(ValueError, match="expected at least one sequence, got 0"):
         plan("train", 0, 8)
     with pytest.raises(ValueError, match="split: expected one of train, validation, test"):

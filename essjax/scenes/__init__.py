@@ -6,6 +6,7 @@ whatever device JAX uses. Conventions are the library's (``essjax.frames``); y i
 
 from essjax.scenes.builder import Scene
 from essjax.scenes.families import (
+    EXTRA_FAMILIES,
     FAMILIES,
     SPLITS,
     TEST_ONLY_FAMILIES,
@@ -19,7 +20,7 @@ from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.sequence import iterate_frames, render_frame, render_sequence, subsample_statistics
 
 __all__ = [
-    "FAMILIES", "SPLITS", "TEST_ONLY_FAMILIES", "TRAIN_FAMILIES", "Scene", "families_of", "iterate_frames",
-    "jitter_sequence", "make_scene", "render_frame", "render_sequence", "split_scenes", "split_seeds",
-    "subsample_statistics",
+    "EXTRA_FAMILIES", "FAMILIES", "SPLITS", "TEST_ONLY_FAMILIES", "TRAIN_FAMILIES", "Scene", "families_of",
+    "iterate_frames", "jitter_sequence", "make_scene", "render_frame", "render_sequence", "split_scenes",
+    "split_seeds", "subsample_statistics",
 ]  # fmt: skip
