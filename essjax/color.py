@@ -37,9 +37,26 @@ def modulate(shading: Color, albedo: Color) -> Color:
     return shading * albedo
 
 
+@jax.custom_vjp
 def log1p(color: Image) -> Image:
-    """log(1 + x) of radiance: what networks see. Negative input counts as 0."""
+    """log(1 + x) of radiance: what networks see. Negative input counts as 0, and there, as at 0, the gradient is 0.
+
+    The gradient is computed from the output, exp(-y): what made the input (a bicubic read, say) can then be fused with
+    the logarithm instead of being stored for the backward pass. Differentiates in reverse mode only.
+    """
     return jnp.log1p(jnp.maximum(color, 0.0))
+
+
+def _log1p_forward(color):
+    encoded = jnp.log1p(jnp.maximum(color, 0.0))
+    return encoded, encoded
+
+
+def _log1p_backward(encoded, gradient):
+    return (jnp.where(encoded > 0, gradient * jnp.exp(-encoded), jnp.zeros_like(gradient)),)
+
+
+log1p.defvjp(_log1p_forward, _log1p_backward)
 
 
 def expm1(encoded: Image) -> Image:

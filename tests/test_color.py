@@ -99,6 +99,16 @@ def test_gradients_are_finite(transform, value):
     assert np.isfinite(jax.grad(transform)(value))
 
 
+def test_the_gradient_of_log1p_needs_only_its_output():
+    """1 / (1 + x) by hand, 0 where nothing was seen; what is kept for it is the output, which others keep as well."""
+    radiance = jnp.array([[-0.5, 0.0, 1e-7, 0.25, 3.0, 65504.0]])
+    encoded, backward = jax.vjp(color.log1p, radiance)
+    np.testing.assert_allclose(backward(jnp.full((1, 6), 2.0))[0], [[0, 0, 2, 1.6, 0.5, 2 / 65505]], rtol=1e-5)
+    np.testing.assert_array_equal(jax.tree.leaves(backward), [encoded])
+    curvature = jax.grad(lambda x: jax.grad(color.log1p)(x))(3.0)
+    np.testing.assert_allclose(curvature, -1 / 16, rtol=1e-5)
+
+
 def test_strict_numerics(strict_numerics):
     image = random_image(0, 2, 3, 3)
     for encode, decode, _ in PAIRS.values():

@@ -11,8 +11,10 @@ from essjax.typing import Array, Image
 
 def pad_to_multiple(image: Image, multiple: int) -> Image:
     """Repeat the last row and column until both sizes are multiples; crop the output back with ``crop``."""
-    height, width = image.shape[-3:-1]
-    pad = [(0, 0)] * (image.ndim - 3) + [(0, -height % multiple), (0, -width % multiple), (0, 0)]
+    below, right = (-size % multiple for size in image.shape[-3:-1])
+    if below == right == 0:
+        return image  # XLA does not see that padding by nothing changes nothing: it would copy, in the gradient as well
+    pad = [(0, 0)] * (image.ndim - 3) + [(0, below), (0, right), (0, 0)]
     return jnp.pad(image, pad, mode="edge")
 
 

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from essjax.networks.blocks import ConvNorm, GatedConv, bilinear_upsample, bilinear_upsample_corners, max_pool
+from essjax.networks.blocks import (
+    ConvNorm,
+    GatedConv,
+    bilinear_upsample,
+    bilinear_upsample_corners,
+    crop,
+    max_pool,
+    pad_to_multiple,
+)
 from essjax.networks.linen import from_linen
 from tests.helpers import random_image
 
@@ -91,3 +99,12 @@ def test_max_pool_and_its_gradient():
     largest = (blocks == blocks.max(axis=-1, keepdims=True)) & (blocks > 1.0)
     expected = (largest * np.asarray(weights)[..., None]).reshape(2, 2, 3, 3, 2, 2).transpose(0, 1, 4, 2, 5, 3)
     np.testing.assert_allclose(gradient, expected.reshape(image.shape), rtol=1e-6)
+
+
+def test_padding_to_a_multiple_repeats_the_last_row_and_column():
+    image = random_image(0, 2, 5, 6, 3)
+    expected = np.pad(image, [(0, 0), (0, 3), (0, 2), (0, 0)], mode="edge")
+    np.testing.assert_array_equal(pad_to_multiple(image, 4), expected)
+    np.testing.assert_array_equal(crop(expected, 5, 6), image)
+    # Nothing to add, nothing to do: a pad by zero pixels is a copy to XLA.
+    assert not jax.make_jaxpr(lambda image: pad_to_multiple(image, 2))(image[:, :4]).eqns

@@ -158,7 +158,10 @@ HALF = random_image(80, H // 2, W // 2, 3)
 LEVELS = [random_image(81 + level, H // 2, W // 2, 2) for level in (0, 1)]
 
 
-def test_frnet_terms_equal_numpy():
+@pytest.mark.parametrize(("length", "first"), [(3, 1), (5, 3), (7, 3)])
+def test_frnet_terms_equal_numpy(length, first):
+    """From frame 3 on, where the two rendered frames differ, if there is such a frame."""
+
     def aux(variables, history, frame, kind):
         if kind == 0:
             return {}
@@ -168,12 +171,13 @@ def test_frnet_terms_equal_numpy():
         assert method == "encode"
         return [variables * image[..., :2], image[..., 1:] ** 2], {}
 
-    clip = numbered(T)
+    clip = numbered(length)
     objective = frnet_objective(fake(aux), Network(None, encode), feature_weight=0.5)
     terms, _ = jax.jit(objective)({"frnet": jnp.float32(2.0)}, clip)
 
-    brightness = np.repeat(1.0 + 0.1 * np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
-    color = np.asarray(clip.frames.color[1:-1]).reshape(T - 2, B, H // 2, 2, W // 2, 2, 3)
+    scored = np.arange(first, length - 1)
+    brightness = np.repeat(1.0 + 0.1 * scored, B).reshape(len(scored), B, 1, 1, 1)
+    color = np.asarray(clip.frames.color[first:-1]).reshape(len(scored), B, H // 2, 2, W // 2, 2, 3)
     target = np.log1p(color.mean(axis=(3, 5)))
     half = np.asarray(HALF) * brightness
     np.testing.assert_allclose(terms["charbonnier"], np.sqrt((half - target) ** 2 + 1e-6).mean(), rtol=1e-4)

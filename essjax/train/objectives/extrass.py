@@ -29,9 +29,15 @@ from essjax.rollout import ESS, SS
 from essjax.train.objectives.common import Objective, both_kinds, odd_length
 from essjax.typing import Array, Callable, PyTree
 
+WITH_TWO_PICTURES = 3
+"""The first frame of a clip that each run extrapolates from two rendered frames: at 1 and 2 both are the same one."""
+
 
 def frnet_objective(method: Method, network: Network, *, feature_weight: float = 0.001) -> Objective:
     """L_FR of ExtraSS eq 7-9: Charbonnier + census on the half-size output, census on features.
+
+    From frame 3 on: before, the two rendered frames that FRNet compares are one and the same. Of three frames, where
+    only frame 1 is extrapolated, that one.
 
     Args:
       method: ``extrass_e``.
@@ -42,8 +48,10 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         clip = odd_length(clip)
         kinds, state = both_kinds(method, variables, clip, keep=lambda aux: aux.get("extrapolated", {}))
-        predicted = kinds[ESS]
-        target = log1p(halve(rendered_color(clip.frames, "frnet")[1:-1]))
+        length = clip.frames.motion.shape[0]
+        first = WITH_TWO_PICTURES if length > WITH_TWO_PICTURES + 1 else 1
+        predicted = jax.tree.map(lambda leaf: leaf[first - 1 :], kinds[ESS])  # kinds begin at frame 1
+        target = log1p(halve(rendered_color(clip.frames, "frnet")[first:-1]))
         # The target's features are given: learned from this side too, they shrink until nothing differs.
         features, _ = network.apply(jax.lax.stop_gradient(variables["frnet"]), target, method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted.features, features, strict=True)]
