@@ -26,6 +26,7 @@ HEAD = """# Benchmarks
 Generated from `experiments/results/*.json` by `python -m experiments.benchmarks_page`; do not edit. Each table is the
 mean over test sequences of one run; PSNR in dB after x/(1+x) and sRGB. SS: rendered frames; ESS: extrapolated frames.
 `taau` gets every frame rendered (twice the input), `taa` every frame at native resolution (eight times the input).
+Frame differences are over two frames, of the same kind in every schedule; in results from before 2026-11-28 over one.
 """
 
 

@@ -18,7 +18,7 @@ from essjax.data import Dataset, Segment, read_segment
 from essjax.data.memory import Kept
 from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
 from essjax.interfaces import Method
-from essjax.metrics import aggregate, mean_over, psnr, score_rollout
+from essjax.metrics import PHASES, aggregate, mean_over, psnr, score_rollout
 from essjax.rollout import ESS, SS, Schedule, alternate, check_supported, every, stream_step
 from essjax.typing import Array, PyTree
 from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
@@ -187,7 +187,9 @@ def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str,
         motion = upsample_motion(frames.motion, scale, jitter=frames.jitter)
     # All frames, so that every sequence has the same shape and compiles once; the warm-up is dropped below.
     everything = list(range(len(kinds)))
-    rows = score_rollout(images, targets, scored=everything, kinds=kinds, holes=holes, motion=motion)
+    rows = score_rollout(
+        images, targets, scored=everything, kinds=kinds, holes=holes, motion=motion, cuts=np.asarray(frames.cut)
+    )
     extra = {"psnr_foreground": _masked_psnr(images, targets, foreground)}
     if low:
         at_samples = reference_at_samples(clip.sequence.reference, frames, scale)
@@ -286,8 +288,8 @@ def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, image
             shown[key] = _new_picture(clip, n, kind, low)
         # Copies: views would keep all frames of all clips in memory.
         shown[key]["images"][name] = images[n].copy()
-        if n:
-            shown[key]["previous"][name] = images[n - 1].copy()
+        if n >= PHASES:
+            shown[key]["previous"][name] = images[n - PHASES].copy()
 
 
 def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
@@ -295,13 +297,14 @@ def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
     rendered = rendered_color(frames, "the report")
     target = rendered if low else clip.sequence.reference
     # What was rendered last: this frame, or the one before where this one is extrapolated.
-    inputs = {"images": n if kind == SS else n - 1, "previous": n - 2 if kind == SS else n - 1}
+    rendered_last = n if kind == SS else n - 1
+    frames_of_part = {"images": (n, rendered_last), "previous": (n - PHASES, rendered_last - PHASES)}
     picture: dict[str, Any] = {
         "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
     }  # fmt: skip
-    for part, index in inputs.items():
+    for part, (frame, index) in frames_of_part.items():
         color = np.repeat(np.repeat(np.asarray(rendered[max(index, 0)]), scale, 0), scale, 1)
-        picture[part] = {"input": color, "reference": np.array(target[n if part == "images" else max(n - 1, 0)])}
+        picture[part] = {"input": color, "reference": np.array(target[max(frame, 0)])}
     return picture
 
 

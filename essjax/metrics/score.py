@@ -13,7 +13,8 @@ from essjax.losses.pixel import as_float32
 from essjax.metrics.psnr import psnr
 from essjax.metrics.ssim import ssim
 from essjax.metrics.temporal import spatio_temporal_error, tpsnr, warped_error
-from essjax.typing import Array, Color, Mask, Motion
+from essjax.typing import Array, Color, Int, Mask, Motion
+from essjax.warp import compose_motion
 
 METRICS = (
     "psnr", "ssim", "psnr_holes", "hole_share", "tpsnr", "warped_error", "warped_error_reference", "ssim_dlctus",
@@ -22,7 +23,14 @@ METRICS = (
 """Names of what ``score_rollout`` measures, in the order of the tables. ``ssim_dlctus`` has the constant C2 = 0.02^2 of
 thesis 002 (section 4.3.5) instead of 0.03^2; the last two are its spatio-temporal loss with theta 0 and 1."""
 
-NEED_THE_PREVIOUS_FRAME = ("tpsnr", "warped_error", "warped_error_reference", "spatial_error", "temporal_error")
+PHASES = 2
+"""Frames from one to the one that temporal metrics compare it with. Where every other frame is rendered, it is of the
+same kind; where all are, it is two frames back as well, so that equal pictures score alike whatever the schedule. The
+frame just before is of the other kind in the first case (or, from a method that extrapolates nothing, a repetition)."""
+SAME_PHASE = ("tpsnr", "warped_error", "warped_error_reference")
+"""Metrics that look ``PHASES`` frames back."""
+CONSECUTIVE = ("spatial_error", "temporal_error")
+"""Metrics of a frame and the one just before, as the thesis defines them: only where every frame is rendered."""
 MIN_HOLE_PIXELS = 16
 """Frames with fewer hole pixels have no ``psnr_holes``: the PSNR of a handful of pixels is noise."""
 
@@ -35,32 +43,38 @@ def score_rollout(
     kinds: Sequence[str],
     holes: Mask | None = None,
     motion: Motion | None = None,
+    cuts: Sequence[bool] | None = None,
 ) -> dict[int, dict[str, Any]]:
     """Metrics of the chosen frames of one sequence, on display-referred images (``color.display`` is applied here).
 
     Args:
       images: ``[T, H, W, 3]`` linear HDR, what a method returned.
       targets: the same shape, what it should have returned.
-      scored: indices of the frames to score; the frames before them are read for the temporal metrics.
+      scored: indices of the frames to score; the two frames before them are read for the temporal metrics.
       kinds: "ss" or "ess" for each of the T frames.
       holes: ``[T, H, W, 1]``, 1 on disoccluded pixels, at the images' resolution; without it ``psnr_holes`` and
         ``hole_share`` are None and the warped error looks at all pixels.
-      motion: ``[T, H, W, 2]`` pixels at the images' resolution, with the jitter difference where the images are
-        jittered; without it the errors that follow it are None.
+      motion: ``[T, H, W, 2]`` to the frame before, pixels at the images' resolution, with the jitter difference where
+        the images are jittered; without it the errors that follow it are None.
+      cuts: for each of the T frames, whether a shot starts there; None: only at frame 0.
 
     Returns:
       frame index -> ``{"kind": ..., metric: float or None}`` for every name in ``METRICS``: dB for the PSNRs, shares
-      and mean absolute differences in [0, 1] for the rest. None where a metric does not exist (frame 0 has no
-      predecessor; fewer than ``MIN_HOLE_PIXELS`` pixels are holes) or is not finite; ``"non_finite"`` is 1 where image
-      or target, of this frame or of the one before, hold NaN or infinity, else 0.
+      and mean absolute differences in [0, 1] for the rest. Temporal metrics compare a frame with the one ``PHASES``
+      before it (those in ``CONSECUTIVE`` with the one just before). None where a metric does not exist (no such frame
+      in the shot, or one of another kind; fewer than ``MIN_HOLE_PIXELS`` pixels are holes) or is not finite;
+      ``"non_finite"`` is 1 where image or target, of this frame or of those that it is compared with, hold NaN or
+      infinity, else 0.
 
     Raises:
-      ValueError: shapes differ, images hold integers, or a frame index or the number of kinds does not fit.
+      ValueError: shapes differ, images hold integers, or a frame index or the number of kinds or cuts does not fit.
     """
     length = images.shape[0]
     images, targets = as_float32(images, targets, ("images", "targets"))
     if len(kinds) != length:
         raise ValueError(f"kinds: expected one per frame, {length}, got {len(kinds)}.")
+    if cuts is not None and len(cuts) != length:
+        raise ValueError(f"cuts: expected one per frame, {length}, got {len(cuts)}.")
     outside = [n for n in scored if not 0 <= n < length]
     if outside:
         raise ValueError(f"scored: expected frames from 0 to {length - 1}, got {outside}.")
@@ -72,44 +86,64 @@ def score_rollout(
     if not scored:
         return {}
     now = np.asarray(scored)
-    before = np.maximum(now - 1, 0)
-    batch = (images[now], images[before], targets[now], targets[before])
-    measured = _score_frames(batch, *(None if value is None else value[now] for value in (holes, motion)))
+    since_cut = _frames_since_cut(length, cuts)
+    alike = np.array([since_cut[n] >= PHASES and kinds[n] == kinds[n - PHASES] for n in scored])
+    consecutive = (since_cut[now] >= 1) & ("ess" not in kinds)
+    # Where there is nothing to compare with: the frame itself, whose values are dropped below.
+    before, like = np.where(consecutive, now - 1, now), np.where(alike, now - PHASES, now)
+    measured = _score_frames(images, targets, holes, motion, np.stack([now, before, like], axis=-1))
     columns = {name: np.asarray(values) for name, values in measured.items()}
     rows = {}
     for k, n in enumerate(scored):
         values = {name: _number(columns[name][k]) if name in columns else None for name in METRICS}
-        if n == 0:
-            values |= dict.fromkeys(NEED_THE_PREVIOUS_FRAME)
+        values |= dict.fromkeys(() if alike[k] else SAME_PHASE) | dict.fromkeys(() if consecutive[k] else CONSECUTIVE)
         rows[n] = {"kind": kinds[n], **values, "non_finite": int(columns["non_finite"][k])}
     return rows
 
 
+def _frames_since_cut(length: int, cuts: Sequence[bool] | None) -> np.ndarray:
+    """How many frames before each one belong to the same shot."""
+    starts = np.zeros(length, bool) if cuts is None else np.array(cuts, bool)
+    starts[0] = True
+    return np.arange(length) - np.maximum.accumulate(np.where(starts, np.arange(length), 0))
+
+
 @jax.jit
-def _score_frames(batch: tuple[Color, ...], holes: Mask | None, motion: Motion | None) -> dict[str, Array]:
+def _score_frames(
+    images: Color, targets: Color, holes: Mask | None, motion: Motion | None, places: Int[Array, "N 3"]
+) -> dict[str, Array]:
     """Frame by frame (``lax.map``), so that memory does not grow with the length of the sequence."""
-    return jax.lax.map(lambda frame: _score_frame(*frame), (batch, holes, motion))
+    return jax.lax.map(lambda place: _score_frame(images, targets, holes, motion, place), places)
 
 
-def _score_frame(batch: tuple[Color, ...], hole: Mask | None, motion: Motion | None) -> dict[str, Array]:
-    image, image_before, target, target_before = (display(picture) for picture in batch)
+def _score_frame(
+    images: Color, targets: Color, holes: Mask | None, motion: Motion | None, place: Int[Array, "3"]
+) -> dict[str, Array]:
+    """Metrics of a frame; ``place`` is its index, that of the one just before and that of the one of its phase."""
+    pictures = images[place], targets[place]
+    image, image_before, image_like = display(pictures[0])
+    target, target_before, target_like = display(pictures[1])
     result = {
-        "non_finite": ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(picture)) for picture in batch])),
+        "non_finite": ~jnp.all(jnp.isfinite(jnp.stack(pictures))),
         "psnr": psnr(image, target),
         "ssim": ssim(image, target),
         "ssim_dlctus": ssim(image, target, c2=0.02**2),
-        "tpsnr": tpsnr(image, image_before, target, target_before),
+        "tpsnr": tpsnr(image, image_like, target, target_like),
     }
-    if hole is not None:
+    valid = None
+    if holes is not None:
+        hole, valid = holes[place[0]], 1.0 - holes[jnp.maximum(place[0] - 1, 0)]
         enough = jnp.sum(hole) >= MIN_HOLE_PIXELS
         result["psnr_holes"] = jnp.where(enough, psnr(image, target, mask=hole), jnp.nan)
         result["hole_share"] = jnp.mean(hole)
     if motion is not None:
-        valid = None if hole is None else 1.0 - hole
-        result["warped_error"] = warped_error(image, image_before, motion, valid=valid)
-        result["warped_error_reference"] = warped_error(target, target_before, motion, valid=valid)
+        last = motion[place[0]]
+        path, known = compose_motion(last, motion[jnp.maximum(place[0] - 1, 0)], valid_previous=valid)
+        valid = None if holes is None else known * (1.0 - hole)
+        result["warped_error"] = warped_error(image, image_like, path, valid=valid)
+        result["warped_error_reference"] = warped_error(target, target_like, path, valid=valid)
         for name, theta in (("spatial_error", 0.0), ("temporal_error", 1.0)):
-            result[name] = spatio_temporal_error(image, image_before, target, target_before, motion, theta=theta)
+            result[name] = spatio_temporal_error(image, image_before, target, target_before, last, theta=theta)
     return result
 
 

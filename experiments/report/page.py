@@ -46,8 +46,8 @@ def write_report(
         metrics ...}]}``; ``"<metric>_range"`` in a row is shown as "±".
       curves: method -> sequence -> one entry per frame and kind, ``{"frame", "kind", "resolution", metrics ...}``.
       pictures: ``{"sequence", "frame", "kind", "resolution", "images": {name: [H, W, 3] linear HDR}, "previous": the
-        same of the frame before (optional, for flicker)}``; the images hold "reference" and, if wanted, "input". Most
-        interesting first: what does not fit the size limit is left out from the end.
+        same of the frame two before (optional, for flicker)}``; the images hold "reference" and, if wanted, "input".
+        Most interesting first: what does not fit the size limit is left out from the end.
       notes: remarks to the reader, one paragraph each.
       references: methods shown for orientation, never marked best, with the reason.
 
@@ -184,18 +184,16 @@ def _fact(name: str, value: str) -> str:
 
 
 def _table(table: Table) -> str:
-    groups = "".join(
-        f'<th colspan="{len(table.columns)}" scope="colgroup">{KIND_NAMES[kind]}</th>' for kind in table.kinds
-    )
+    groups = "".join(f'<th colspan="{len(COLUMNS)}" scope="colgroup">{KIND_NAMES[kind]}</th>' for kind in table.kinds)
     labels = "".join(
         f'<th scope="col" title="{html.escape(column.help)}"{_edge(k)}>{column.label}</th>'
         for _ in table.kinds
-        for k, column in enumerate(table.columns)
+        for k, column in enumerate(COLUMNS)
     )
     body = []
     for line in table.lines:
         cells = [
-            f"<td{_edge(k % len(table.columns))}>{'<b>' + cell.text + '</b>' if cell.best else cell.text}</td>"
+            f"<td{_edge(k % len(COLUMNS))}>{'<b>' + cell.text + '</b>' if cell.best else cell.text}</td>"
             for k, cell in enumerate(line.cells)
         ]
         remark = f"<small>{html.escape(line.remark)}</small>" if line.remark else ""

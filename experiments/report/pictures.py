@@ -20,7 +20,7 @@ class Picture(NamedTuple):
       kind: "ss" or "ess".
       resolution: "lr" or "hr".
       images: name -> display-referred float32 ``[h, w, 3]`` in [0, 1]; "reference" last, "input" (if any) first.
-      previous: the same of the frame before, for the names that have it; {} if unknown.
+      previous: the same of the frame two before, for the names that have it; {} if unknown.
       focus: (x, y) of the top left corner of the crop where methods disagree most, reference pixels.
       scores: name -> PSNR in dB against the reference, for images of its size.
     """
@@ -39,7 +39,7 @@ class Picture(NamedTuple):
         return pixels.error(self.images[name], self.images["reference"])
 
     def flicker(self, name: str) -> np.ndarray:
-        """Temporal difference error of a method, ``[H, W]``; zeros where the frame before is not known."""
+        """Temporal difference error of a method, ``[H, W]``; zeros where the frame two before is not known."""
         reference = self.images["reference"]
         if name not in self.previous or "reference" not in self.previous:
             return np.zeros(reference.shape[:2], np.float32)

@@ -29,9 +29,10 @@ COLUMNS = (
     Column("ssim", "SSIM", 4, 1.0, "high", "Gaussian window 11, sigma 1.5, C1 = 0.01², C2 = 0.03²"),
     Column("psnr_holes", "holes", 2, 1.0, "high", "PSNR (dB) on disoccluded pixels only"),
     Column("tpsnr", "tPSNR", 2, 1.0, "high",
-           "PSNR (dB) of frame differences; high = no more flicker than the reference"),
+           "PSNR (dB) of the change over two frames, of the same kind in every schedule; high = no more flicker than "
+           "the reference"),
     Column("warped_error", "Δwarp", 2, 1e3, "zero",
-           "10³ · mean |I_t − warp(I_t−1)| minus the reference's own: + flickers, − is smoother than the truth"),
+           "10³ · mean |I_t − warp(I_t−2)| minus the reference's own: + flickers, − is smoother than the truth"),
 )  # fmt: skip
 
 KIND_NAMES = {"ss": "rendered (SS)", "ess": "extrapolated (ESS)", "all": "all frames"}
@@ -55,15 +56,11 @@ class Line(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What one resolution and one sequence (or "mean") scored; the title says against what.
-
-    Each kind of frame has the same columns, those that say something.
-    """
+    """What one resolution and one sequence (or "mean") scored, ``COLUMNS`` per kind; the title says against what."""
 
     title: str
     sequence: str
     kinds: list[str]
-    columns: tuple[Column, ...]
     lines: list[Line]
 
 
@@ -122,11 +119,7 @@ def make_table(
     kinds = [kind for kind in ("ss", "ess") if kind in present] or sorted(present)
     methods = dict.fromkeys(method for method, _ in rows)
     methods = sorted(methods, key=lambda method: (method in references, -_quality(rows, method, kinds)))
-    # Low-resolution extrapolation shows each rendered frame as it is: the frame before is the target itself, and the
-    # error of the difference to it that of the frame.
-    repeated = {"tpsnr"} if resolution == "lr" and kinds == ["ess"] else set()
-    shown = tuple(column for column in COLUMNS if column.key not in repeated)
-    columns = [(kind, column) for kind in kinds for column in shown]
+    columns = [(kind, column) for kind in kinds for column in COLUMNS]
     values = {(m, k, c.key): shown_value(rows.get((m, k)), c) for m in methods for k, c in columns}
     comparable = [method for method in methods if method not in references]
     best = {(k, c.key): _best([values[m, k, c.key] for m in comparable], c.best) for k, c in columns}
@@ -138,11 +131,11 @@ def make_table(
             marked = value is not None and method in comparable and value == best[kind, column.key]
             cells.append(Cell(_text(value, rows.get((method, kind)), column), marked))
         spoiled = sum((rows.get((method, kind)) or {}).get("non_finite", 0) for kind in kinds)
-        lost = f"NaN or infinity in or just before {spoiled} frames: no mean of what they spoil" if spoiled else ""
+        lost = f"NaN or infinity in or before {spoiled} frames: no mean of what they spoil" if spoiled else ""
         lines.append(Line(method, cells, "; ".join(filter(None, (references.get(method), lost)))))
     shares = [row["hole_share"] for row in rows.values() if row.get("hole_share") is not None]
     holes = f" (holes: {100 * sum(shares) / len(shares):.1f} % of the pixels)" if shares else ""
-    return Table(RESOLUTION_NAMES[resolution] + holes, sequence, kinds, shown, lines)
+    return Table(RESOLUTION_NAMES[resolution] + holes, sequence, kinds, lines)
 
 
 def _quality(rows: Mapping[tuple[str, str], Mapping[str, Any]], method: str, kinds: list[str]) -> float:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.report.rows import Table, headline, make_table, resolutions
+from experiments.report.rows import COLUMNS, Table, headline, make_table, resolutions
 
 
 def print_table(
@@ -32,7 +32,7 @@ def print_table(
         table = make_table(metrics, resolution, sequence, references)
         if not table.lines:
             continue
-        for count in range(len(table.columns), 0, -1):  # the widest that fits: cut numbers help nobody
+        for count in range(len(COLUMNS), 0, -1):  # the widest that fits: cut numbers help nobody
             grid = _grid(table, count)
             if console.measure(grid, options=unlimited).maximum <= console.width:
                 break
@@ -49,11 +49,11 @@ def _grid(table: Table, count: int) -> RichTable:
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False)
     grid.add_column("method", no_wrap=True)
     for kind in table.kinds:
-        for column in table.columns[:count]:
+        for column in COLUMNS[:count]:
             grid.add_column(f"{kind.upper()}\n{column.label}", justify="right", no_wrap=True)
     for line in table.lines:
         name = f"{line.method} *" if line.remark else line.method
-        chosen = [cell for k, cell in enumerate(line.cells) if k % len(table.columns) < count]
+        chosen = [cell for k, cell in enumerate(line.cells) if k % len(COLUMNS) < count]
         cells = [Text(cell.text, style="bold green" if cell.best else "") for cell in chosen]
         grid.add_row(Text(name, style="dim" if line.remark else ""), *cells)
     return grid

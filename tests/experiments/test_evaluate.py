@@ -1,5 +1,6 @@
 """The summary of an evaluation: means per sequence and over sequences; clips that are read one at a time."""
 
+import dataclasses
 import gc
 import weakref
 
@@ -9,6 +10,7 @@ import pytest
 
 from essjax import methods
 from essjax.data import write_dataset, write_sequence
+from essjax.frames import Prediction
 from experiments import evaluate as module
 from experiments.evaluate import Clips, Runner, _summarise, evaluate, load_clip
 from tests.helpers import make_sequence
@@ -82,6 +84,31 @@ def test_clips_are_read_when_asked_for_and_kept_within_the_bound(dataset, reads)
         np.testing.assert_array_equal(outline.sequence.reference, expected.sequence.reference[:1])
         assert outline.sequence.reference.base is None  # a view would hold the whole clip
         np.testing.assert_array_equal(outline.holes, expected.holes)
+
+
+def test_equal_pictures_score_alike_whatever_the_schedule(tmp_path):
+    """One method is given every frame, one every other frame; what the second shows in between is its own affair."""
+    made = make_sequence(5, 8, 1, 12, 16)
+    cut = np.arange(8) == 0
+    frames = dataclasses.replace(made.frames, cut=jax.numpy.asarray(cut)[:, None])
+    made = dataclasses.replace(made, frames=frames, valid=jax.numpy.ones_like(made.frames.gbuffers.depth))
+    write_sequence(tmp_path, "s", jax.tree.map(lambda leaf: np.array(leaf[:, 0]), made))
+    dataset = write_dataset(tmp_path, {"test": ["s"]})
+    clips = [load_clip(dataset, dataset.segments("test")[0], 2)]
+    half = methods.jau()
+    whole = half._replace(info=half.info._replace(renders_all=True))
+    dark = half._replace(
+        extrapolate_step=lambda variables, history, frame, *, train=False: (
+            history,
+            Prediction(image=0 * history["image"]),
+        )
+    )
+    found = evaluate({name: Runner(m, {}) for name, m in (("whole", whole), ("half", half), ("dark", dark))}, clips)
+    rows = [row for row in found["rows"] if row["sequence"] == "mean"]
+    assert [row["frame_count"] for row in rows] == [1, 1, 1] and rows[0]["tpsnr"] > 5 and rows[0]["warped_error"] > 0
+    for name in ("psnr", "tpsnr", "warped_error", "warped_error_reference", "psnr_foreground"):
+        assert rows[0][name] == rows[1][name] == rows[2][name]
+    assert rows[0]["temporal_error"] is not None and rows[1]["temporal_error"] is None
 
 
 def test_native_frames_are_read_on_request(dataset):

@@ -203,24 +203,13 @@ def test_table_order_best_and_references():
     assert without.lines[0].method == "taau" or without.lines[0].cells[0].text != "31.00"
 
 
-def test_flicker_that_only_repeats_the_error_has_no_column():
-    """LR extrapolation beside rendered frames that are shown as they are; other tables keep the column."""
-    metrics = make_metrics()
-    table = make_table(metrics, "lr", "mean")
-    assert table.kinds == ["ess"] and [c.key for c in table.columns] == ["psnr", "ssim", "psnr_holes", "warped_error"]
-    assert [cell.text for cell in table.lines[0].cells] == ["25.00", "0.6250", "19.00", "–"]
-    assert make_table(metrics, "hr", "mean").columns == COLUMNS
-    metrics["rows"].append({**row("upscaler", "ss", 24.0), "resolution": "lr"})  # rendered frames have errors too
-    assert make_table(metrics, "lr", "mean").columns == COLUMNS
-
-
 def test_frames_that_are_not_finite_stand_in_the_remark():
     metrics = make_metrics()
     for row in metrics["rows"]:
         if row["method"] in ("bilinear", "taau") and row["frames"] == "ss":
             row |= {"psnr": None, "non_finite": 3}
     lines = {line.method: line for line in make_table(metrics, "hr", "mean", REFERENCES).lines}
-    expected = "NaN or infinity in or just before 3 frames: no mean of what they spoil"
+    expected = "NaN or infinity in or before 3 frames: no mean of what they spoil"
     assert lines["bilinear"].remark == expected and lines["bilinear"].cells[0] == ("–", False)
     assert lines["taau"].remark == f"{REFERENCES['taau']}; {expected}" and lines["extrass"].remark == ""
 

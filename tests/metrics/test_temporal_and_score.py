@@ -59,6 +59,7 @@ def rollout():
 
 
 KINDS = ("ss", "ess", "ss", "ess", "ss")
+EVERY = ("ss",) * T
 
 
 def test_score_rollout_matches_numpy(rollout):
@@ -73,26 +74,60 @@ def test_score_rollout_matches_numpy(rollout):
             gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         )  # fmt: skip
         assert row["ssim"] == pytest.approx(expected, abs=1e-4)
-        change = (images[n] - images[n - 1]) - (targets[n] - targets[n - 1])
+        change = (images[n] - images[n - 2]) - (targets[n] - targets[n - 2])
         assert row["tpsnr"] == pytest.approx(-10 * np.log10((change**2).mean()), rel=1e-4)
-        valid = np.asarray(rollout["holes"][n, ..., 0]) == 0
-        assert row["warped_error"] == pytest.approx(np.abs(images[n] - images[n - 1])[valid].mean(), rel=1e-4)
-        expected = np.abs(targets[n] - targets[n - 1])[valid].mean()
+        hole = np.asarray(rollout["holes"][..., 0]) == 1
+        valid = ~hole[n] & ~hole[n - 1]  # nothing moves
+        assert row["warped_error"] == pytest.approx(np.abs(images[n] - images[n - 2])[valid].mean(), rel=1e-4)
+        expected = np.abs(targets[n] - targets[n - 2])[valid].mean()
         assert row["warped_error_reference"] == pytest.approx(expected, rel=1e-4)
         assert row["ssim"] - 0.2 < row["ssim_dlctus"] < row["ssim"]  # the smaller constant forgives less
-        x, y = images[n] - targets[n], images[n - 1] - targets[n - 1]  # nothing moves
-        assert row["spatial_error"] == pytest.approx((np.abs(x) + np.abs(y)).mean(), rel=1e-4)
-        assert row["temporal_error"] == pytest.approx(np.abs(x - y).mean(), rel=1e-4)
-        assert row["hole_share"] == pytest.approx(1 - valid.mean(), rel=1e-5)
+        assert row["hole_share"] == pytest.approx(hole[n].mean(), rel=1e-5)
+        assert row["spatial_error"] is None and row["temporal_error"] is None  # the frame before is of another kind
     error = (images[3] - targets[3])[2:8, 3:7] ** 2
     assert rows[3]["psnr_holes"] == pytest.approx(-10 * np.log10(error.mean()), rel=1e-4)
     assert rows[4]["psnr_holes"] is None  # 15 pixels are too few
 
 
+def test_where_every_frame_is_rendered_the_thesis_loss_looks_one_frame_back(rollout):
+    images, targets = shown(rollout["images"]), shown(rollout["targets"])
+    row = score_rollout(**rollout, scored=[3], kinds=EVERY)[3]
+    x, y = images[3] - targets[3], images[2] - targets[2]  # nothing moves
+    assert row["spatial_error"] == pytest.approx((np.abs(x) + np.abs(y)).mean(), rel=1e-4)
+    assert row["temporal_error"] == pytest.approx(np.abs(x - y).mean(), rel=1e-4)
+
+
+def test_temporal_metrics_are_those_of_equal_phases(rollout):
+    """Pictures between those that count change nothing; without a frame of the same kind in the shot there is none."""
+    temporal = ("tpsnr", "warped_error", "warped_error_reference")
+    values = lambda rows, n: [rows[n][name] for name in temporal]
+    one = score_rollout(**rollout, scored=[2, 3, 4], kinds=EVERY)
+    repeated = {**rollout, "images": rollout["images"].at[3].set(rollout["images"][2])}
+    other = score_rollout(**repeated, scored=[2, 3, 4], kinds=KINDS)
+    assert values(other, 2) == values(one, 2) and values(other, 4) == values(one, 4)
+    assert values(other, 3) != values(one, 3)
+    parity = score_rollout(**rollout, scored=[1, 2, 3], kinds=("ss", "ss", "ess", "ss", "ess"))
+    assert values(parity, 3) == values(one, 3) and values(parity, 1) == values(parity, 2) == [None] * 3
+    cut = score_rollout(**rollout, scored=[2, 3, 4], kinds=EVERY, cuts=[True, False, True, False, False])
+    assert values(cut, 2) == values(cut, 3) == [None] * 3 and values(cut, 4) == values(one, 4)
+    assert cut[2]["temporal_error"] is None and cut[3]["temporal_error"] == one[3]["temporal_error"]
+
+
+def test_warped_error_follows_both_motions():
+    """A picture that moves right by 2, then by 1, in a shot without holes but what enters the screen."""
+    first = random_image(1, H, W, 3, high=1.0)
+    images = jnp.stack([first, jnp.roll(first, 2, axis=1), jnp.roll(first, 3, axis=1)])
+    motion = jnp.stack([jnp.broadcast_to(jnp.array([x, 0.0]), (H, W, 2)) for x in (0.0, -2.0, -1.0)])
+    holes = jnp.zeros((3, H, W, 1)).at[1, :, :2].set(1.0).at[2, :, :1].set(1.0)
+    score = lambda motion: score_rollout(images, images, scored=[2], kinds=EVERY[:3], holes=holes, motion=motion)[2]
+    assert score(motion)["warped_error"] == pytest.approx(0.0, abs=1e-6)
+    assert score(motion.at[1].set(0.0))["warped_error"] > 0.05
+
+
 def test_first_frame_and_missing_masks(rollout):
     first = score_rollout(**rollout, scored=[0], kinds=KINDS)[0]
     assert first["tpsnr"] is None and first["warped_error"] is None and first["psnr"] > 0
-    bare = score_rollout(rollout["images"], rollout["targets"], scored=[1], kinds=KINDS)[1]
+    bare = score_rollout(rollout["images"], rollout["targets"], scored=[2], kinds=KINDS)[2]
     assert set(bare) == {"kind", *METRICS, "non_finite"} and bare["non_finite"] == 0
     assert bare["tpsnr"] > 0
     assert all(bare[name] is None for name in ("psnr_holes", "hole_share", "warped_error", "warped_error_reference"))
@@ -111,14 +146,14 @@ def test_an_image_that_is_not_finite_cannot_improve_a_mean(rollout, value):
     """The bad frame would be left out of a mean of numbers: 1 of 2 frames, the better one."""
     images = rollout["images"].at[2, 3, 4, 0].set(value)
     rows = score_rollout(**{**rollout, "images": images}, scored=[1, 2, 3, 4], kinds=KINDS)
-    assert [row["non_finite"] for row in rows.values()] == [0, 1, 1, 0]  # frame 3's temporal metrics read frame 2
-    assert rows[2]["psnr"] is None and rows[3]["psnr"] > 0 and rows[3]["tpsnr"] is None
+    assert [row["non_finite"] for row in rows.values()] == [0, 1, 0, 1]  # frame 4's temporal metrics read frame 2
+    assert rows[2]["psnr"] is None and rows[4]["psnr"] > 0 and rows[4]["tpsnr"] is None
     mean = aggregate(rows.values())
     assert mean["psnr"] is None and mean["ssim"] is None and mean["tpsnr"] is None
     assert mean["non_finite"] == 2 and mean["frame_count"] == 4
-    extrapolated = aggregate([rows[1], rows[3]])
-    assert extrapolated["psnr"] > 0 and extrapolated["tpsnr"] is None and extrapolated["non_finite"] == 1
-    over_sequences = aggregate([mean, aggregate([rows[1], rows[4]])])
+    followed = aggregate([rows[1], rows[3], rows[4]])
+    assert followed["psnr"] > 0 and followed["tpsnr"] is None and followed["non_finite"] == 1
+    over_sequences = aggregate([mean, aggregate([rows[1], rows[3]])])
     assert over_sequences["psnr"] is None and over_sequences["non_finite"] == 2
     bad_target = score_rollout(**{**rollout, "targets": images}, scored=[2], kinds=KINDS)
     assert bad_target[2]["non_finite"] == 1
@@ -137,6 +172,8 @@ def test_sixteen_bit_frames_score_as_the_same_numbers_in_float32(rollout, dtype)
 def test_messages(rollout):
     with pytest.raises(ValueError, match="kinds: expected one per frame, 5, got 2"):
         score_rollout(**rollout, scored=[1], kinds=("ss", "ess"))
+    with pytest.raises(ValueError, match="cuts: expected one per frame, 5, got 1"):
+        score_rollout(**rollout, scored=[1], kinds=KINDS, cuts=[True])
     with pytest.raises(ValueError, match=r"scored: expected frames from 0 to 4, got \[5\]"):
         score_rollout(**rollout, scored=[2, 5], kinds=KINDS)
     with pytest.raises(ValueError, match=r"holes: expected \(5, 13, 18\) as the images, got \(5, 6, 9\)"):
