@@ -30,10 +30,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _compare(options: argparse.Namespace, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
+    from experiments.cache import keep_programs
     from experiments.experiment import default_folder
 
     if options.list:
         return print_variants(console)
+    keep_programs(options.compilation_cache)
     names = list(dict.fromkeys(name.strip() for name in options.variants.split(",") if name.strip()))
     if not names:
         raise ValueError("--variants: expected names separated by commas, got none. --list shows all.")

@@ -20,6 +20,10 @@ def shared_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="continue an interrupted run in --out")
     parser.add_argument("--eval-only", action="store_true", help="evaluate the checkpoint in --out, no training")
     parser.add_argument("--list", action="store_true", help="list the variants and stop")
+    parser.add_argument(
+        "--no-compilation-cache", dest="compilation_cache", action="store_false",
+        help="compile everything anew instead of keeping programs in ~/.cache/essjax",
+    )  # fmt: skip
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -76,12 +80,14 @@ def print_variants(console: Console) -> int:
 
 def _run(options: argparse.Namespace, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
+    from experiments.cache import keep_programs
     from experiments.experiment import check_folder, default_folder, run_experiment
     from experiments.profile import write_profile
     from experiments.variants import config_of
 
     if options.list:
         return print_variants(console)
+    keep_programs(options.compilation_cache)
     name = options.variant
     config = config_of(name, options.preset, options.overrides)
     out = Path(options.out) if options.out else default_folder(name, options.preset, options.data)

@@ -1,6 +1,8 @@
 """Choose the settings of the TAA family on validation frames: a baseline is only worth beating at its best."""
 
+import functools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -39,9 +41,9 @@ def tune(variant: Variant, config: Config, clips: Sequence[Clip]) -> Setting:
     A clamp replaces the first one only if it gains more than the standard error of the gain over the clips: what a few
     clips choose by chance costs more on others than it gained.
     """
-    chosen, scores = _tune_clamp(variant, config, clips, CLAMPS[0])
-    for clamp in CLAMPS[1:]:
-        other, other_scores = _tune_clamp(variant, config, clips, clamp)
+    with ThreadPoolExecutor(len(CLAMPS)) as pool:  # each compiles steps of its own, which is most of the time
+        (chosen, scores), *others = pool.map(functools.partial(_tune_clamp, variant, config, clips), CLAMPS)
+    for other, other_scores in others:
         gain = other_scores - scores
         if gain.mean() > (gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0):
             chosen, scores = other, other_scores

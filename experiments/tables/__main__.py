@@ -30,12 +30,14 @@ def main(arguments: list[str] | None = None) -> int:
 def _tables(options: argparse.Namespace, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
     from experiments import tables
+    from experiments.cache import keep_programs
     from experiments.experiment import write_json
 
     if options.list:
         for name, table in tables.TABLES.items():
             console.print(f"  [bold]{name:<12}[/bold] {table.title} ({table.source})", soft_wrap=True)
         return 0
+    keep_programs(options.compilation_cache)
     chosen = [tables.get_table(name) for name in dict.fromkeys(options.names or tables.TABLES)]
     out = Path(options.out or f"runs/tables-{options.preset}")
     results: dict[str, Any] = {"schema": 1, "kind": "tables", "preset": options.preset, "runs": [], "tables": {}}

@@ -1,6 +1,7 @@
 """Which setting of a TAA method is chosen, from scores that the test makes up."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
@@ -38,3 +39,16 @@ def test_another_clamp_must_win_beyond_doubt(monkeypatch, gains, clamp):
     assert chosen.clamp == clamp
     assert (chosen.alpha, chosen.sigma) == (0.4, 0.8)
     assert chosen.psnr == pytest.approx(BASE + (np.mean(gains) if clamp == "none" else 0.0), abs=1e-5)
+
+
+def test_the_clamps_are_tried_side_by_side(monkeypatch):
+    """Each waits until the other has come as far: one after the other, nobody would ever come."""
+    meet = threading.Barrier(len(tuning.CLAMPS), timeout=20)
+
+    def score(method, grid, clip):
+        meet.wait()
+        return np.zeros(len(grid))
+
+    variant = dataclasses.replace(get_variant("taau"), method=lambda config, *, clamp: clamp)
+    monkeypatch.setattr(tuning, "_score_grid", score)
+    assert tuning.tune(variant, PRESETS["quick"], [0]).clamp == tuning.CLAMPS[0]
