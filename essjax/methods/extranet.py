@@ -26,6 +26,9 @@ REQUIRES = frozenset({"base_color", "normal", "roughness", "metallic"})
 WINDOW = 2 * FRAMES
 """Frames from the oldest one that a prediction looks back at to itself: t-5, t-3, t-1 are rendered."""
 
+ENGINE = (1.0, -1.0, 1.0)
+"""World axes of Unreal, which is left-handed, over ours: its import presets negate y."""
+
 
 @pytree
 class Kept:
@@ -84,7 +87,7 @@ def _around(memory: Memory, frame: Frame, valid: Mask) -> Motion:
 
 
 def network_inputs(
-    memory: Memory, frame: Frame, *, occlusion: bool = True, sky: bool = True, mode: str = "bilinear"
+    memory: Memory, frame: Frame, *, occlusion: bool = True, published: bool = False, mode: str = "bilinear"
 ) -> Inputs:
     """Warps, masks and features for ``frame``, to which ``memory`` was advanced; no gradient.
 
@@ -95,7 +98,7 @@ def network_inputs(
       memory: of rendered frames.
       frame: the new one.
       occlusion: also warp by occlusion motion vectors (section 4.2); False: Table 7's "w/o OMV".
-      sky: False shows the background of rendered frames as black.
+      published: as published weights need it, see ``extranet``: a black sky, normals of a left-handed world.
       mode: how shading is read, see ``warp.sample``; it may have more than three channels.
     """
     frames, kept = memory.frames, memory.frames.content
@@ -110,13 +113,16 @@ def network_inputs(
     valid = jnp.where(expand_flag(memory.count == 0, valid.ndim - 1), 0.0, valid * frames.valid)
     if frame.reactive is not None:
         valid = valid * (1.0 - frame.reactive)
-    shading = kept.shading if sky else jnp.where(background(kept.gbuffers), 0.0, kept.shading)
+    shading = jnp.where(background(kept.gbuffers), 0.0, kept.shading) if published else kept.shading
     plain = log1p(backward_warp(shading, motion, mode=mode))
     warped = [plain[0]]
     if occlusion:
         warped.append(log1p(backward_warp(shading[0], _around(memory, frame, valid[0]), mode=mode)))
+    normal = surface_guides(frame.gbuffers)[1]
+    if published:
+        normal = normal * jnp.asarray(ENGINE)
     # Nothing was hit: the published weights were trained with (-1, -1, -1) there.
-    normal = jnp.where(background(frame.gbuffers), -1.0, surface_guides(frame.gbuffers)[1])
+    normal = jnp.where(background(frame.gbuffers), -1.0, normal)
     features = [normal, relative_depth(frame.gbuffers), frame.gbuffers.roughness, frame.gbuffers.metallic]
     inputs = Inputs(
         warped=jnp.concatenate(warped, axis=-1),
@@ -127,18 +133,19 @@ def network_inputs(
     return jax.lax.stop_gradient(inputs)
 
 
-def extranet(*, history: bool = True, occlusion: bool = True, sky: bool = True) -> Method:
+def extranet(*, history: bool = True, occlusion: bool = True, published: bool = False) -> Method:
     """ExtraNet: extrapolates frames between rendered ones at low resolution; rendered ones are returned as they are.
 
     ``variables = {"extranet": {"params", "batch_stats"}}``, 262,141 parameters; ``from_torch`` reads published ones,
-    for which ``sky`` must be False. A fresh network returns the plain warp of the demodulated frame. ``aux`` of an
+    for which ``published`` must be True. A fresh network returns the plain warp of the demodulated frame. ``aux`` of an
     extrapolated step: ``log_shading`` (the output, demodulated, log1p) and ``inputs`` (``Inputs``).
 
     Args:
       history: with the history encoder (Table 7, HE).
       occlusion: with a warp by occlusion motion vectors (Table 7, OMV).
-      sky: the network extrapolates the background too. False: it sees black there, and the background is warped (by
-        occlusion motion where it was disoccluded); the published weights never saw a sky, whose base colour is 0.
+      published: for published weights, which never saw a sky and were trained in Unreal's left-handed world (z up). The
+        network sees a black background, which is warped instead (by occlusion motion where it was disoccluded), and
+        normals whose y is negated: so they are the engine's again in frames that ``essjax import`` turned right-handed.
     """
     network = networks.extranet(history=history)
 
@@ -153,11 +160,11 @@ def extranet(*, history: bool = True, occlusion: bool = True, sky: bool = True) 
 
     def extrapolate_step(variables, history, frame, *, train=False):
         memory = _advance(history, frame)
-        seen = network_inputs(memory, frame, occlusion=occlusion, sky=sky)
+        seen = network_inputs(memory, frame, occlusion=occlusion, published=published)
         inputs = seen.warped, seen.mask, seen.features, seen.history
         log_shading, state = network.apply(variables["extranet"], *inputs, train=train)
         image = modulate(expm1(log_shading), albedo(frame.gbuffers))
-        if not sky:  # it is not modulated: shading is colour
+        if published:  # the sky is not modulated: shading is colour
             behind = backward_warp(memory.frames.content.shading[0], _around(memory, frame, seen.mask))
             image = jnp.where(background(frame.gbuffers), jax.lax.stop_gradient(behind), image)
         aux = {"log_shading": log_shading, "inputs": seen}
@@ -168,7 +175,7 @@ def extranet(*, history: bool = True, occlusion: bool = True, sky: bool = True) 
 
 
 def from_torch(weights: str | Path | Mapping[str, Array]) -> PyTree:
-    """Variables of ``extranet(sky=False)`` from published weights.
+    """Variables of ``extranet(published=True)`` from published weights.
 
     Args:
       weights: a file (see ``tensors.read_tensors``; a ``.pth.tar`` needs no PyTorch), or arrays by the published names.

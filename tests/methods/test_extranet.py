@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from essjax.color import demodulate, expm1, log1p, modulate
+from essjax.data.importing.images import buffer
+from essjax.data.importing.recipe import load_recipe
 from essjax.frames import select_time, without_color
 from essjax.methods import extranet, extranet_from_torch
 from essjax.methods.extranet import relative_depth
@@ -110,7 +112,7 @@ def test_before_training_it_warps_the_demodulated_frame():
 
 def test_published_weights_see_a_black_sky_and_the_sky_is_warped():
     """On frames whose rendered sky is another colour only the sky changes, and its pixels come from the warp."""
-    frames, method = random_frames(7), extranet(sky=False)
+    frames, method = random_frames(7), extranet(published=True)
     sky = ~np.isfinite(frames.gbuffers.depth)
     render = step(SS)
     extrapolate = jax.jit(method.extrapolate_step)
@@ -131,6 +133,30 @@ def test_published_weights_see_a_black_sky_and_the_sky_is_warped():
     warped = backward_warp(before, occlusion_motion(lookup, at.gbuffers.depth, seen.mask))
     np.testing.assert_allclose(np.asarray(one.image)[~surface], np.asarray(warped)[~surface], rtol=1e-4, atol=1e-5)
     assert 5 < (~surface).sum() < surface.sum()
+
+
+def test_published_weights_see_the_normals_of_the_engine():
+    """From an Unreal dump through the import preset to the network: the normals are those of the dump."""
+    dumped = np.random.default_rng(3).normal(size=(H, W, 3)).astype(np.float32)
+    dumped /= np.linalg.norm(dumped, axis=-1, keepdims=True)
+    imported, _ = buffer("normal", dumped, np.ones((H, W, 1), bool), load_recipe("extranet"))
+    frames = random_frames(8)
+    sky = np.asarray(~np.isfinite(frames.gbuffers.depth[5]))
+    normal = jnp.where(jnp.isinf(frames.gbuffers.depth), 0.0, imported)
+    frames = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, normal=normal))
+
+    def seen(method):
+        return (
+            jax.jit(method.extrapolate_step)(
+                variables(), method.start(select_time(frames, 4)), without_color(select_time(frames, 5))
+            )[1]
+            .aux["inputs"]
+            .features[..., :3]
+        )
+
+    expected = np.where(sky, -1.0, dumped)
+    np.testing.assert_allclose(seen(extranet(published=True)), expected, atol=1e-6)
+    np.testing.assert_allclose(seen(METHOD), np.where(sky, -1.0, dumped * [1, -1, 1]), atol=1e-6)
 
 
 def test_depth_as_the_published_weights_know_it():
