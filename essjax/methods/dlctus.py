@@ -48,6 +48,28 @@ def linear_depth(depth: Plane, near: float, far: float) -> Plane:
     return jnp.clip((depth - near) / (far - near), 0.0, 1.0)
 
 
+@jax.custom_vjp
+def returning_clip(x: Array) -> Array:
+    """``clip(x, 0, 1)`` whose gradient outside [0, 1] is that of the identity where descent leads back inside.
+
+    ``clip`` itself has no gradient there: when all outputs of the network have left the range, in one large step of the
+    optimiser, training is over and the image is the JAU frame. What would lead farther away has none here either.
+    """
+    return jnp.clip(x, 0.0, 1.0)
+
+
+def _returning_clip_forward(x: Array) -> tuple[Array, Array]:
+    return returning_clip(x), x
+
+
+def _returning_clip_backward(x: Array, gradient: Array) -> tuple[Array]:
+    away = ((x < 0.0) & (gradient > 0.0)) | ((x > 1.0) & (gradient < 0.0))  # a step goes against the gradient
+    return (jnp.where(away, 0.0, gradient),)
+
+
+returning_clip.defvjp(_returning_clip_forward, _returning_clip_backward)
+
+
 def _name(reprojection: str, dilate: bool, accumulation: bool) -> str:
     parts = ["" if accumulation else "no-accumulation", "dilated" if dilate else ""]
     parts += ["" if reprojection == "bicubic-0.75" else reprojection.replace("-", "")]
@@ -121,7 +143,7 @@ def dlctus(
             aligned = jnp.concatenate([aligned, jnp.ones_like(aligned[..., :1])], axis=-1)
         past = reproject(history, frame, aligned)
         outputs, _ = network.apply(variables["dlctus"], jnp.concatenate([sampled, past], axis=-1), train=train)
-        rate, decay = (jnp.clip(outputs[..., k : k + 1], 0.0, 1.0) for k in range(2))
+        rate, decay = (returning_clip(outputs[..., k : k + 1]) for k in range(2))
         mixed = aligned * rate + past * (1.0 - rate)  # eq 44
         quality = mixed[..., 3:] * decay if accumulation else None  # eq 45
         encoded = jnp.clip(mixed[..., :3], 0.0, 1.0)

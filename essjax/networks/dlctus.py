@@ -21,10 +21,7 @@ WIDTH, RESIDUAL_BLOCKS = 32, 4
 
 
 def _small_bound(key: Key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
-    """Uniform in +-1 / sqrt(fan-in), what PyTorch does: with He's noise the four blocks' sum leaves the clamp.
-
-    Outside [0, 1] the outputs have no gradient.
-    """
+    """Uniform in +-1 / sqrt(fan-in), what PyTorch does: with He's noise the four blocks' sum leaves the clamp."""
     return kernel_bound(key, shape, dtype) / math.sqrt(6.0)
 
 

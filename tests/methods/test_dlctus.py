@@ -13,7 +13,7 @@ from essjax import methods
 from essjax.color import reinhard
 from essjax.frames import select_time, without_color
 from essjax.methods import dlctus
-from essjax.methods.dlctus import REPROJECTIONS
+from essjax.methods.dlctus import REPROJECTIONS, returning_clip
 from essjax.networks import dlctus_network
 from essjax.rollout import SS, alternate, every, stream_step, unroll
 from essjax.warp import backward_warp, jitter_aligned_upsample, zero_upsample
@@ -182,6 +182,36 @@ def test_untrained_outputs_lie_inside_the_clamp():
     inputs = random_image(4, 1, 32, 32, 8, high=1.0)
     outputs, _ = network.apply(network.init(jax.random.key(2), inputs), inputs)
     assert float(jnp.mean((outputs > 0) & (outputs < 1))) > 0.7
+
+
+def test_clip_leads_back_inside():
+    """Forward bit by bit ``jnp.clip``; a gradient passes outside of [0, 1] where descent leads back, and only there."""
+    x = jnp.array([-jnp.inf, -2.0, -0.0, 0.0, 0.3, 1.0, 1.0 + 1e-6, 7.0, jnp.inf, jnp.nan])
+    np.testing.assert_array_equal(jax.jit(returning_clip)(x), jnp.clip(x, 0.0, 1.0))
+    inward = jax.jit(jax.vjp(returning_clip, x)[1])
+    np.testing.assert_array_equal(inward(jnp.full(10, 2.0))[0][:9], [0, 0, 2, 2, 2, 2, 2, 2, 2])
+    np.testing.assert_array_equal(inward(jnp.full(10, -2.0))[0][:9], [-2, -2, -2, -2, -2, -2, 0, 0, 0])
+
+
+@pytest.mark.parametrize("bias", [-9.0, 9.0], ids=["only history", "only new samples"])
+def test_outputs_outside_the_clamp_have_a_gradient(bias):
+    """All of o1 and o2 left the range, the state in which training at the rate of ``quick`` used to end."""
+    frames, target = random_frames(9), random_image(11, T, B, 2 * H, 2 * W, 3, high=1.0)
+    variables = jax.tree.map(jnp.copy, VARIABLES)
+    variables["dlctus"]["params"]["Conv_8"]["bias"] = jnp.full(32, bias)
+
+    @jax.jit
+    def gradient(variables):
+        def loss(variables):
+            aux = unroll(METHOD, variables, frames, every(), keep=lambda aux: aux).aux[SS]
+            return jnp.mean(jnp.abs(aux["encoded"] - target)), aux["rate"]
+
+        return jax.grad(loss, has_aux=True)(variables)
+
+    moved, rate = gradient(variables)
+    assert float(rate.min()) == float(rate.max()) == (bias > 0)
+    norms = [float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(moved)]
+    assert all(np.isfinite(norms)) and min(norms) > 1e-6, norms
 
 
 # --- The laws of a method --------------------------------------------------------------------------------------------
