@@ -88,6 +88,7 @@ def unroll(
     train: bool = False,
     keep: Callable[[dict], PyTree] = lambda aux: {},
     remat: bool = False,
+    history: PyTree | None = None,
 ) -> Rollout:
     """Run ``method`` over ``frames`` (leaves ``[T, ...]``, colour in every frame).
 
@@ -99,6 +100,7 @@ def unroll(
       train: passed to the steps.
       keep: chooses from each prediction's ``aux`` what to stack in time; nothing by default.
       remat: recompute the steps in the backward pass instead of storing their intermediates.
+      history: what precedes frame 0, as ``Rollout.history`` of the frames before; None: ``method.start``.
 
     Raises:
       ValueError: a buffer is missing, or the schedule extrapolates and the method cannot.
@@ -108,7 +110,7 @@ def unroll(
     kinds = schedule.kinds(length)
     pairs = max((length - schedule.lead) // schedule.period, 0)
     body_end = schedule.lead + pairs * schedule.period
-    history = method.start(select_time(frames, 0))
+    history = method.start(select_time(frames, 0)) if history is None else history
 
     def run(history, frame, kind):
         def step(variables, history, frame):

@@ -184,3 +184,15 @@ def test_streaming_equals_the_rollout():
         history, image = steps[kind](VARIABLES, history, at(frames, n))
         images.append(image)
     np.testing.assert_allclose(jnp.stack(images), compiled(EVEN)(frames).image, rtol=1e-6)
+
+
+def test_a_rollout_goes_on_from_the_history_of_another():
+    """In two parts, cut between pairs, it gives what the whole gives; a cut in the second part still forgets all."""
+    frames = make_frames(3, 7, 2, 4, 6)
+    frames = dataclasses.replace(frames, cut=jnp.asarray(frames.cut).at[5].set(True))
+    whole = compiled(EVEN)(frames)
+    first = compiled(EVEN)(select_time(frames, slice(0, 4)))
+    rest = select_time(frames, slice(4, 7))
+    second = jax.jit(lambda frames, history: unroll(TOY, VARIABLES, frames, EVEN, history=history))(rest, first.history)
+    np.testing.assert_allclose(jnp.concatenate([first.image, second.image]), whole.image, rtol=1e-6)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), second.history, whole.history)

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import grain
 import jax
@@ -141,7 +141,8 @@ def disk_source(
     return DiskSource(dataset, split, native=native, ranges=ranges, memory=memory)
 
 
-def _cuts(source: Source, index: int) -> np.ndarray:
+def cuts_of(source: Source, index: int) -> np.ndarray:
+    """Bool ``[T]``: which frames of sequence ``index`` are cuts."""
     return source.cuts(index) if isinstance(source, DiskSource) else np.asarray(source[index].frames.cut)
 
 
@@ -153,7 +154,7 @@ def windows(source: Source, length: int) -> list[tuple[int, int]]:
     """
     found, longest = [], 0
     for index in range(len(source)):
-        cut = _cuts(source, index)
+        cut = cuts_of(source, index)
         longest = max(longest, len(cut))
         starts = range(len(cut) - length + 1)
         found += [(index, start) for start in starts if not cut[start + 1 : start + length].any()]
@@ -176,7 +177,7 @@ def _outline(source: Source, index: int) -> tuple[int, int, Any]:
     return shape[1], shape[2], (sequence.scale, jax.tree.structure(sequence))
 
 
-def _check_alike(source: Source, crop: tuple[int, int] | None) -> None:
+def check_alike(source: Source, crop: tuple[int, int] | None) -> None:
     """All sequences must hold the same buffers at the same scale, and be of one size or fit the crop."""
     first = _outline(source, 0)
     for index in range(len(source)):
@@ -198,6 +199,39 @@ def _cut_out(source: Source, index: int, start: int, length: int, box: tuple[int
     return clip if box is None else crop_sequence(clip, *box)
 
 
+class View(NamedTuple):
+    """What a clip shows of each frame of a sequence.
+
+    Attributes:
+      box: top, left, height and width in LR pixels, or None for whole frames.
+      flips: directions, see ``flip``.
+    """
+
+    box: tuple[int, int, int, int] | None
+    flips: tuple[str, ...]
+
+
+def draw_view(
+    source: Source, index: int, crop: tuple[int, int] | None, flips: bool, random: np.random.Generator
+) -> View:
+    """A random view of sequence ``index``: ``crop`` (height, width) anywhere in its frames, mirrored or not."""
+    height, width, _ = _outline(source, index)
+    size = crop or (height, width)
+    top, left = random.integers(0, height - size[0] + 1), random.integers(0, width - size[1] + 1)
+    chosen = random.random(2) < 0.5
+    directions = zip(("horizontal", "vertical"), chosen, strict=True)
+    box = None if size == (height, width) else (int(top), int(left), *size)
+    return View(box, tuple(direction for direction, yes in directions if flips and yes))
+
+
+def cut_clip(source: Source, index: int, start: int, length: int, view: View) -> Sequence:
+    """``length`` frames of sequence ``index`` from ``start``, ``[length, h, w, C]``; cuts stay as they are."""
+    clip = _cut_out(source, index, start, length, view.box)
+    for direction in view.flips:
+        clip = flip(clip, direction)
+    return clip
+
+
 def make_clip(
     source: Source,
     index: int,
@@ -208,19 +242,11 @@ def make_clip(
     random: np.random.Generator,
 ) -> Sequence:
     """One clip ``[length, h, w, C]``: a window in time, a random one in space, random flips; frame 0 is a cut."""
-    height, width, _ = _outline(source, index)
-    size = crop or (height, width)
-    top, left = random.integers(0, height - size[0] + 1), random.integers(0, width - size[1] + 1)
-    chosen = random.random(2) < 0.5
-    box = None if size == (height, width) else (int(top), int(left), *size)
-    clip = _cut_out(source, index, start, length, box)
-    for direction, yes in zip(("horizontal", "vertical"), chosen, strict=True):
-        if flips and yes:
-            clip = flip(clip, direction)
-    return start_with_cut(clip)
+    return start_with_cut(cut_clip(source, index, start, length, draw_view(source, index, crop, flips, random)))
 
 
-def _stack(batch: Any) -> Sequence:
+def stack_clips(batch: Any) -> Sequence:
+    """Clips ``[T, h, w, C]`` as one batch ``[T, B, h, w, C]``."""
     return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *batch)
 
 
@@ -261,7 +287,7 @@ def clips(
     if length < 1 or batch < 1:
         raise ValueError(f"clips: expected length >= 1 and batch >= 1, got {length} and {batch}.")
     found = windows(source, length)
-    _check_alike(source, crop)
+    check_alike(source, crop)
 
     def cut_out(window: tuple[int, int], random: np.random.Generator) -> Sequence:
         return make_clip(source, *window, length, crop, flips, random)
@@ -272,6 +298,6 @@ def clips(
         .shuffle()
         .repeat(epochs)
         .random_map(cut_out)
-        .batch(batch, drop_remainder=True, batch_fn=_stack)
+        .batch(batch, drop_remainder=True, batch_fn=stack_clips)
         .to_iter_dataset(grain.ReadOptions(num_threads=min(threads, prefetch), prefetch_buffer_size=prefetch))
     )

@@ -4,6 +4,7 @@ from essjax.train.checkpoint import Checkpoints
 from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, train
 from essjax.train.objectives import (
     Objective,
+    Recurrent,
     both_kinds,
     classification_objective,
     composition_objective,
@@ -21,7 +22,7 @@ from essjax.train.state import TrainState, constant, cosine, create_state, halvi
 from essjax.train.step import make_train_step
 
 __all__ = [
-    "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "TrainState", "both_kinds",
+    "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "Recurrent", "TrainState", "both_kinds",
     "classification_objective", "composition_objective", "constant", "cosine", "create_state", "dlctus_objective",
     "extranet_objective", "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective",
     "learning_rate", "make_train_step", "nsrr_objective", "odd_length", "optimizer", "predict_last", "train",

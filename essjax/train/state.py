@@ -20,11 +20,13 @@ class TrainState:
       variables: all of the method's variables; a stage trains one entry, the others are frozen.
       optimizer: optax state of the trained entry, its arrays behind each other as one vector.
       step: steps taken, int32.
+      history: what the next clip goes on from where clips follow each other (``Recurrent``), else None.
     """
 
     variables: PyTree
     optimizer: PyTree
     step: Array
+    history: PyTree = None
 
 
 def optimizer(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
@@ -36,17 +38,20 @@ def optimizer(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
     return optax.flatten(optax.chain(optax.clip_by_global_norm(clip_norm), optax.scale_by_adam()))
 
 
-def create_state(variables: PyTree, trained: str, transform: optax.GradientTransformation) -> TrainState:
-    """A state at step 0 that trains ``variables[trained]``.
+def create_state(
+    variables: PyTree, trained: str, transform: optax.GradientTransformation, *, history: PyTree = None
+) -> TrainState:
+    """A state at step 0 that trains ``variables[trained]``; with ``history`` (``Recurrent.start``) on successive clips.
 
     Raises:
       ValueError: there is no such entry.
     """
     if trained not in variables:
         raise ValueError(f"trained: expected one of {', '.join(sorted(variables))}, got {trained!r}.")
-    variables = jax.tree.map(jnp.array, variables)  # copies: the train step donates its state
+    variables, history = jax.tree.map(jnp.array, (variables, history))  # copies: the train step donates its state
     weights, _ = split_statistics(variables[trained])
-    return TrainState(variables=variables, optimizer=transform.init(weights), step=jnp.zeros((), jnp.int32))
+    step = jnp.zeros((), jnp.int32)
+    return TrainState(variables=variables, optimizer=transform.init(weights), step=step, history=history)
 
 
 def split_statistics(entry: PyTree) -> tuple[PyTree, PyTree]:

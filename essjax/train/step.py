@@ -1,6 +1,5 @@
 """The train step: one jitted function, state donated."""
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -9,13 +8,13 @@ import jax.numpy as jnp
 import optax
 
 from essjax.frames import Sequence
-from essjax.train.objectives import Objective
+from essjax.train.objectives import Objective, Recurrent
 from essjax.train.state import TrainState, split_statistics
 from essjax.typing import Array, Callable, PyTree
 
 
 def make_train_step(
-    objective: Objective,
+    objective: Objective | Recurrent,
     transform: optax.GradientTransformation,
     trained: str,
     *,
@@ -24,7 +23,8 @@ def make_train_step(
     """``step(state, clip, learning_rate) -> (state, terms)``, jitted, the state donated.
 
     ``terms`` holds the weighted terms, ``loss`` (their sum) and ``gradient_norm``. A step whose loss or gradient is not
-    finite changes nothing but the step count; the loop raises ``NonFiniteLoss``.
+    finite changes nothing but the step count; the loop raises ``NonFiniteLoss``. Where the state holds a history, clips
+    follow each other and ``objective`` is a ``Recurrent``.
 
     Args:
       objective: ``(variables, clip) -> (terms, state)``; the statistics that it returns for ``trained`` are folded
@@ -39,21 +39,25 @@ def make_train_step(
         weights, statistics = split_statistics(state.variables[trained])
 
         def loss(weights):
-            terms, new = objective({**state.variables, trained: {**weights, **statistics}}, clip)
-            return sum(terms.values()), (terms, new.get(trained, {}))
+            variables = {**state.variables, trained: {**weights, **statistics}}
+            if state.history is None:
+                terms, new, history = *objective(variables, clip), None
+            else:
+                terms, new, history = objective.follow(variables, clip, state.history)
+            return sum(terms.values()), (terms, new.get(trained, {}), history)
 
-        (total, (terms, new_statistics)), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
+        (total, (terms, new_statistics, history)), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(total) & jnp.isfinite(norm)
         updates, new_optimizer = transform.update(gradient, state.optimizer, weights)
         updates = jax.tree.map(lambda update: -learning_rate * update, updates)
         new_weights: PyTree = optax.apply_updates(weights, updates)
         new_entry = {**statistics, **new_statistics, **new_weights}
-        new = (new_entry, new_optimizer)
-        old = (state.variables[trained], state.optimizer)
-        entry, new_optimizer = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+        new = (new_entry, new_optimizer, history)
+        old = (state.variables[trained], state.optimizer, state.history)
+        entry, new_optimizer, history = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
         variables = {**state.variables, trained: entry}
-        state = dataclasses.replace(state, variables=variables, optimizer=new_optimizer, step=state.step + 1)
+        state = TrainState(variables=variables, optimizer=new_optimizer, step=state.step + 1, history=history)
         return state, {**terms, "loss": total, "gradient_norm": norm}
 
     return step

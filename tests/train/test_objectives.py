@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from essjax.frames import Prediction
+from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo, Network, reset_at_cut
 from essjax.losses import census, feature_census
 from essjax.methods.extrass import Warped
 from essjax.rollout import ESS, SS
-from essjax.train import both_kinds, extrass_objective, frnet_objective
+from essjax.train import Recurrent, both_kinds, extrass_objective, frnet_objective
+from essjax.train.objectives.common import follow_both_kinds, since_cut, start_both_kinds
 from tests.helpers import make_sequence, random_image
 
 T, B, H, W = 5, 2, 14, 18
@@ -74,6 +75,37 @@ def test_even_or_short_clips_are_refused(length):
         both_kinds(fake(lambda *_: {}), {}, numbered(length), keep=lambda aux: aux)
 
 
+def follow(objective, windows, length):
+    """Terms of clips that follow each other in ``numbered``: window k is frames k (length - 1) and on."""
+    whole = numbered((length - 1) * windows + 1)
+    parts = [select_time(whole, slice(k * (length - 1), (k + 1) * (length - 1) + 1)) for k in range(windows)]
+    history, found, run = objective.start(parts[0]), [], jax.jit(objective.follow)
+    for number, part in enumerate(parts):
+        cut = part.frames.cut.at[0].set(number == 0)
+        part = dataclasses.replace(part, frames=dataclasses.replace(part.frames, cut=cut))
+        terms, _, history = run({}, part, history)
+        found.append(terms)
+    return found
+
+
+def test_both_runs_go_on_where_the_clip_before_ended():
+    """Every frame has the history that one long clip gives it; frame 0 of a clip is the last of the one before."""
+
+    def aux(variables, history, frame, kind):
+        number = frame.motion[..., 0, 0, 0]
+        return {"frame": number, "kind": jnp.full_like(number, kind), "before": history}
+
+    method = fake(aux)
+    recurrent = Recurrent(
+        lambda clip: start_both_kinds(method, clip),
+        lambda variables, clip, history: tuple(follow_both_kinds(method, variables, clip, lambda aux: aux, history)),
+    )
+    (whole,) = follow(recurrent, 1, 13)
+    for number, part in enumerate(follow(recurrent, 3, 5)):
+        expected = jax.tree.map(lambda leaf, first=4 * number: leaf[first : first + 3], whole)
+        jax.tree.map(np.testing.assert_array_equal, part, expected)
+
+
 IMAGES = {kind: random_image(40 + kind, 2 * H, 2 * W, 3) for kind in (0, 1)}
 HISTORIES = {kind: random_image(50 + kind, 2 * H, 2 * W, 3) for kind in (0, 1)}
 VALID = {kind: random_image(60 + kind, 2 * H, 2 * W, 1, high=1.0) < 0.7 for kind in (0, 1)}
@@ -107,24 +139,44 @@ def test_extrass_terms_equal_numpy(exact_masks):
     )
     terms, _ = jax.jit(objective)({}, clip)
 
-    brightness = np.repeat(1.0 + 0.1 * np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
+    number = np.repeat(np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
+    brightness, weight = 1.0 + 0.1 * number, (number + 1) / 8.0
     target = np.log1p(np.asarray(clip.reference[1:-1]))
     expected = {"features": 0.0}
     for kind, name in ((0, SS), (1, ESS)):
         image, history = (np.asarray(pattern[kind]) * brightness for pattern in (IMAGES, HISTORIES))
         own = np.broadcast_to(np.asarray(VALID[kind], np.float64), (T - 2, B, 2 * H, 2 * W, 1))
         valid = np.repeat(np.repeat(clip.valid[1:-1], 2, axis=2), 2, axis=3) if exact_masks else own
-        expected[f"l1_{name}"] = np.abs(image - target).mean()
-        expected[f"occlusion_{name}"] = 2.0 * weighted(np.abs(image - target), 1.0 - valid)
-        expected[f"temporal_{name}"] = 3.0 * weighted(np.abs(image - history), own)
+        expected[f"l1_{name}"] = weighted(np.abs(image - target), weight)
+        expected[f"occlusion_{name}"] = 2.0 * weighted(np.abs(image - target), weight * (1.0 - valid))
+        expected[f"temporal_{name}"] = 3.0 * weighted(np.abs(image - history), weight * own)
         difference = np.expm1(image) - np.expm1(target)
         levels = difference[..., ::2, ::2, :], 3.0 * difference[..., :1]
-        expected[f"vgg_{name}"] = 0.5 * sum((level**2).mean() for level in levels)
+        expected[f"vgg_{name}"] = 0.5 * sum(weighted(level**2, weight) for level in levels)
     for a, b in zip(FEATURES[0], FEATURES[1], strict=True):
-        expected["features"] += 3.0 * (np.abs(a - b) * brightness[1:]).mean()  # frame 1 is left out
+        expected["features"] += 3.0 * weighted(np.abs(a - b) * brightness[1:], weight[1:])  # frame 1 is left out
     assert set(terms) == set(expected)
     for name, value in expected.items():
         np.testing.assert_allclose(terms[name], value, rtol=1e-4, err_msg=name)
+
+
+def test_frames_since_a_cut():
+    cut = jnp.array([[False, True], [False, False], [True, False], [False, True]])
+    since = np.asarray(since_cut(cut))
+    assert (since[:2, 0] > 1000).all()
+    np.testing.assert_array_equal(since[2:, 0], [0, 1])
+    np.testing.assert_array_equal(since[:, 1], [0, 1, 2, 0])
+
+
+def test_a_frame_counts_the_more_the_longer_its_shot_has_lasted():
+    """(n + 1) / 8 for frame n of a start; all alike in the clip that follows it."""
+    reference = np.log1p(np.asarray(numbered(17).reference))
+    for number, terms in enumerate(follow(extrass_objective(fake(extrass_aux)), 2, 9)):
+        frames = np.arange(1, 8) + 8 * number
+        images = np.asarray(IMAGES[0]) * (1.0 + 0.1 * frames).reshape(7, 1, 1, 1, 1)
+        errors = np.abs(images - reference[frames]).mean(axis=(1, 2, 3, 4))
+        weight = np.minimum((frames + 1) / 8, 1.0)
+        np.testing.assert_allclose(terms["l1_ss"], np.sum(weight * errors) / np.sum(weight), rtol=1e-5)
 
 
 @pytest.mark.parametrize(("length", "expected"), [(3, 0.0), (7, 3.0)])

@@ -11,6 +11,7 @@ import pytest
 
 from essjax.train import (
     Checkpoints,
+    Recurrent,
     constant,
     cosine,
     create_state,
@@ -104,6 +105,34 @@ def test_non_finite_step_changes_nothing_but_the_count():
         np.testing.assert_array_equal, (after.variables, after.optimizer), (before.variables, before.optimizer)
     )
     assert int(after.step) == 2
+
+
+def test_a_recurrent_objective_carries_its_history_in_the_state(tmp_path):
+    """Its history is the sum of the clips' first colours: carried on, kept by checkpoints, not spoilt by a bad clip."""
+
+    def follow(variables, clip, history):
+        terms, state = tiny_run.objective(variables, clip)
+        return terms, state, history + clip.frames.color[0]
+
+    objective = Recurrent(lambda clip: jnp.zeros_like(clip.frames.color[0]), follow)
+    batches = tiny_run.tiny_batches()
+    clips = [jax.tree.map(jnp.asarray, next(batches)) for _ in range(2)]
+    state, step = tiny_run.initial_state(), make_train_step(objective, optimizer(), "fit")
+    variables = {name: state.variables[name] for name in ("fit", "frozen")}
+    state = create_state(variables, "fit", optimizer(), history=objective.start(clips[0]))
+    for clip in clips:
+        state, _ = step(state, clip, 0.1)
+    expected = np.asarray(clips[0].frames.color[0] + clips[1].frames.color[0])
+    np.testing.assert_allclose(state.history, expected, rtol=1e-6)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(2, state, {"seconds": 1.0})
+    np.testing.assert_array_equal(checkpoints.restore(state)[0].history, state.history)
+    checkpoints.close()
+    bad = jax.tree.map(lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, clips[0])
+    np.testing.assert_allclose(step(state, bad, 0.1)[0].history, expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        objective(variables, clips[0])[0]["near"], tiny_run.objective(variables, clips[0])[0]["near"]
+    )
 
 
 def test_the_callers_variables_survive_donation():

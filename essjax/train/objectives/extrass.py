@@ -26,8 +26,16 @@ from essjax.losses import (
 from essjax.methods.extrass import halve
 from essjax.networks.blocks import nearest_upsample
 from essjax.rollout import ESS, SS
-from essjax.train.objectives.common import Objective, both_kinds, odd_length
-from essjax.typing import Array, Callable, PyTree
+from essjax.train.objectives.common import (
+    Objective,
+    Recurrent,
+    both_kinds,
+    follow_both_kinds,
+    odd_length,
+    since_cut,
+    start_both_kinds,
+)
+from essjax.typing import Array, Callable, Image, PyTree
 
 WITH_TWO_PICTURES = 3
 """The first frame of a clip that each run extrapolates from two rendered frames: at 1 and 2 both are the same one."""
@@ -65,6 +73,10 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
     return objective
 
 
+RAMP = 8
+"""Frames after a start until a frame counts in full: before, the network has seen too little to do better."""
+
+
 def extrass_objective(
     method: Method,
     *,
@@ -72,8 +84,10 @@ def extrass_objective(
     vgg_weight: float = 0.01,
     temporal_weight: float = 1.0,
     vgg_features: Callable | None = None,
-) -> Objective:
-    """L of ExtraSS eq 11-14 over both kinds of every inner frame of a clip; features are compared from frame 2 on.
+) -> Recurrent:
+    """L of ExtraSS eq 11-14 over both kinds of every inner frame of a clip; features: where both encoders see history.
+
+    Frame n after a cut has the weight (n + 1) / 8, at most 1.
 
     Args:
       method: ``extrass``.
@@ -86,27 +100,36 @@ def extrass_objective(
     def keep(aux: dict) -> dict:
         return {name: aux[name] for name in ("log_image", "warped", "features")}
 
-    def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
-        clip = odd_length(clip)
-        kinds, state = both_kinds(method, variables, clip, keep)
-        target = log1p(clip.reference[1:-1])
+    def start(clip: Sequence) -> PyTree:
+        return start_both_kinds(method, clip)
+
+    def follow(variables: PyTree, clip: Sequence, history: PyTree) -> tuple[dict[str, Array], PyTree, PyTree]:
+        kinds, state, history = follow_both_kinds(method, variables, clip, keep, history)
+        target, since = log1p(clip.reference[1:-1]), since_cut(clip.frames.cut)[1:-1]
+        weight = jnp.minimum((since + 1) / RAMP, 1.0)
+        pixels = weight[..., None, None, None]
         terms: dict[str, Array] = {}
         for kind, predicted in kinds.items():
             image, warped = predicted["log_image"], predicted["warped"]
             valid = warped.valid if clip.valid is None else nearest_upsample(clip.valid[1:-1], clip.scale)
-            terms[f"l1_{kind}"] = jnp.mean(l1(image, target))
-            terms[f"occlusion_{kind}"] = occlusion_weight * masked_mean(occlusion(image, target, 1 - valid), 1 - valid)
-            history = temporal_l1(image, warped.log_image, warped.valid)
-            terms[f"temporal_{kind}"] = temporal_weight * masked_mean(history, warped.valid)
+            hole = 1 - valid
+            terms[f"l1_{kind}"] = _mean(l1(image, target), weight)
+            terms[f"occlusion_{kind}"] = occlusion_weight * masked_mean(occlusion(image, target, hole), pixels * hole)
+            change = temporal_l1(image, warped.log_image, warped.valid)
+            terms[f"temporal_{kind}"] = temporal_weight * masked_mean(change, pixels * warped.valid)
             if vgg_features is not None:
-                difference = perceptual(expm1(image), expm1(target), vgg_features)
-                terms[f"vgg_{kind}"] = vgg_weight * sum_of_means(difference)
-        # Without frame 1: as SS it starts a run, so E0 sees no history there, and E1 does.
-        given, features = ([level[1:] for level in kinds[kind]["features"]] for kind in (SS, ESS))
+                levels = perceptual(expm1(image), expm1(target), vgg_features)
+                terms[f"vgg_{kind}"] = vgg_weight * sum(_mean(level, weight) for level in levels)
+        # Without the frame after a cut: as SS it starts a run, so E0 sees no history there, and E1 does.
+        weight = jnp.where(since > 1, weight, 0.0)
         # E1 follows E0: drawn to each other, both shrink to zero (experiments/LOG.md).
-        levels = feature_l1(jax.lax.stop_gradient(given), features)
-        # Of three frames none is left, and a mean over none is NaN.
-        terms["features"] = temporal_weight * sum_of_means([level for level in levels if level.size])
-        return terms, state
+        levels = feature_l1(jax.lax.stop_gradient(kinds[SS]["features"]), kinds[ESS]["features"])
+        terms["features"] = temporal_weight * sum(_mean(level, weight) for level in levels)
+        return terms, state, history
 
-    return objective
+    return Recurrent(start, follow)
+
+
+def _mean(values: Image, weight: Array) -> Array:
+    """Mean over frames ``[T, B, H, W, C]`` that count ``weight`` ``[T, B]`` each; 0 where none counts."""
+    return masked_mean(jnp.mean(values, axis=(-3, -2, -1)), weight)
