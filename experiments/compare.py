@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.run import guarded, print_variants, shared_options
+from experiments.run import exit_code, guarded, print_variants, shared_options
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -23,7 +23,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2, a signal 130."""
+    """Run the command; bad input prints one line and returns 2, a signal 130, a run with a dead network 1."""
     options = parse(arguments)
     return guarded(lambda console: _compare(options, console))
 
@@ -40,11 +40,11 @@ def _compare(options: argparse.Namespace, console: Console) -> int:
     if not names:
         raise ValueError("--variants: expected names separated by commas, got none. --list shows all.")
     out = Path(options.out) if options.out else default_folder("compare", options.preset, options.data)
-    compare(
+    metrics = compare(
         names, preset=options.preset, overrides=options.overrides, data=options.data, out=out, resume=options.resume,
         eval_only=options.eval_only, console=console,
     )  # fmt: skip
-    return 0
+    return exit_code(metrics, console)
 
 
 def compare(

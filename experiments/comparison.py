@@ -6,14 +6,15 @@ from typing import Any, NamedTuple
 
 import jax
 
-from essjax.data import Dataset, Segment
+from essjax.data import Dataset
 from essjax.data.layout import read_json, write_json
 from essjax.frames import Sequence as FrameSequence
 from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.typing import PyTree
+from experiments import checks
 from experiments.config import Config
-from experiments.evaluate import Clip, Clips, Runner, scored_frames
+from experiments.evaluate import Clip, Clips, Runner
 from experiments.tuning import Setting, setting_variables, tune
 from experiments.variants import VARIANTS, compared, stages_of, trained_as
 
@@ -22,37 +23,16 @@ class Trained(NamedTuple):
     """What training a variant gave.
 
     Attributes:
-      variables: entry -> linen variables.
+      initial: entry -> linen variables, before training.
+      variables: the same after it.
       config: the settings that it was trained with.
-      report: stage -> ``{"steps", "seconds", "terms"}``.
+      report: stage -> what ``essjax.train.train`` says of it.
     """
 
+    initial: PyTree
     variables: PyTree
     config: Config
     report: dict[str, Any]
-
-
-def check_scored(dataset: Dataset, config: Config) -> None:
-    """Refuse data with sequences of which no frame is scored, before anything is trained.
-
-    Raises:
-      ValueError: a test sequence, or a validation sequence where methods are tuned on them, is all warm-up.
-    """
-    for split in ("validation", "test") if config.tune else ("test",):
-        empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, config)]
-        if empty:
-            raise ValueError(
-                f"{dataset.path}, split {split}: expected frames to score in every sequence, got none in "
-                f"{', '.join(empty)}: all are among the {config.warmup} that warm up at the start and after a cut. "
-                "Give longer sequences, or fewer frames to warm up with --set warmup=N."
-            )
-
-
-def _has_scored(dataset: Dataset, segment: Segment, config: Config) -> bool:
-    """What ``load_clip`` will find, without reading an image."""
-    cuts = {record["number"]: record["cut"] for record in dataset.sequences[segment.sequence].frames}
-    numbers = dataset.numbers(segment)
-    return bool(scored_frames([cuts[n] for n in numbers], dataset.scored(segment), config.warmup))
 
 
 def make_runners(
@@ -81,7 +61,7 @@ def make_runners(
     kept = _read_settings(out / "tuning.json")
     frames = select_time(example.frames, 0)
     for row in compared(names):
-        variant, owner = VARIANTS[row], _owner(row, names, trained)
+        variant, owner = VARIANTS[row], owner_of(row, names, trained)
         own_config = trained[owner].config if owner else config
         method = variant.method(own_config)
         if method.info.native and not native:
@@ -106,7 +86,7 @@ def make_runners(
     return runners, settings
 
 
-def _owner(row: str, names: Sequence[str], trained: Mapping[str, Trained]) -> str | None:
+def owner_of(row: str, names: Sequence[str], trained: Mapping[str, Trained]) -> str | None:
     """The trained variant whose variables ``row`` runs with; None for a heuristic."""
     if trained_as(row) in trained:
         return trained_as(row)
@@ -116,12 +96,7 @@ def _owner(row: str, names: Sequence[str], trained: Mapping[str, Trained]) -> st
 
 def unfit(method: Method, sequence: FrameSequence) -> str:
     """Why ``method`` cannot be run and scored on ``sequence``, or an empty string."""
-    missing = sorted(method.info.requires - set(frame_images(sequence.frames)))
-    if missing:
-        return f"this dataset has no {', '.join(missing)}"
-    if method.info.scale not in (1, sequence.scale):
-        return f"it enlarges {method.info.scale:g} times, this dataset's reference is {sequence.scale} times larger"
-    return ""
+    return checks.unfit(method.info, frame_images(sequence.frames), sequence.scale)
 
 
 def _read_settings(path: Path) -> dict[str, Setting]:

@@ -72,7 +72,7 @@ PRESETS: dict[str, Config] = {
     "smoke": Config(
         size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=3, crop=(32, 24),
         batch=2, first_batch=2, width=8, first_width=8, first_steps=4, steps=6, first_seconds=None, seconds=None,
-        tune=False, optimize=False,
+        warmup=2, tune=False, optimize=False,
     ),
     "quick": Config(),
     "paper": Config(

@@ -21,6 +21,15 @@ def train_clips(config: Config, number: int = 0) -> list[Clip]:
     return plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=start)
 
 
+def scene_clips(config: Config) -> list[Clip]:
+    """The built-in scenes of a run: of all splits."""
+    return [
+        *train_clips(config),
+        *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp),
+        *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
+    ]
+
+
 def render_settings(config: Config) -> dict[str, Any]:
     """Of the built-in renderer, for all splits."""
     return {"scale": config.scale, "mip_bias": config.mip_bias, "jitter": config.jitter}
@@ -52,13 +61,8 @@ def prepare(
         dataset = read_dataset(data)
     else:
         width, height = config.size
-        clips = [
-            *train_clips(config),
-            *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp),
-            *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
-        ]
         settings = {**render_settings(config), "native": True, "ranges": ranges}
-        dataset = generate(out / "scenes", clips, width, height, progress=progress, **settings)
+        dataset = generate(out / "scenes", scene_clips(config), width, height, progress=progress, **settings)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):
             raise ValueError(

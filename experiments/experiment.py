@@ -4,6 +4,7 @@ Data, training, tuning of the baselines, evaluation, report: each part resumes w
 """
 
 import dataclasses
+import itertools
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -11,20 +12,23 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from essjax.data import Dataset
 from essjax.data.layout import read_json
 from essjax.deploy import method_cost
-from experiments import datasets
+from essjax.typing import PyTree
+from experiments import datasets, health
 from experiments import environment as machine
+from experiments.alarm import no_alarm
+from experiments.checks import check_dataset, check_settings
 from experiments.classes import QUESTIONS, class_remark, evaluate_classes
-from experiments.comparison import Trained, check_scored, make_runners, notes, table_references
+from experiments.comparison import Trained, make_runners, notes, owner_of, table_references
 from experiments.config import Config
 from experiments.evaluate import Clip, Clips, Runner, evaluate
+from experiments.progress import Phases
 from experiments.report import print_table, write_report
 from experiments.report.classes import write_class_sheet
-from experiments.training import restore_stages, train_stages
+from experiments.training import initial_variables, restore_stages, train_stages
 from experiments.variants import VARIANTS, compared, stages_of, trained_as
 from experiments.variants.classifier import thresholds
 
@@ -92,8 +96,10 @@ def run_experiment(
       The content of ``metrics.json``.
 
     Raises:
-      ValueError: data that does not fit, or of which no frame would be scored.
+      ValueError: settings or data that do not fit, or of which no frame would be scored.
     """
+    if data is None:
+        check_settings(names, configs)
     config, clock, seconds = configs[names[0]], time.monotonic(), {}
 
     def lap(name: str) -> None:
@@ -101,11 +107,11 @@ def run_experiment(
         now = time.monotonic()
         seconds[name], clock = round(now - clock, 1), now
 
-    with Progress(*_COLUMNS, console=console) as progress:
-        bar = progress.add_task("data", total=None, text="")
+    with no_alarm(), Phases(console) as phases:
+        phases.show("data", text="reading" if data else "rendering")
 
         def on_frame(n: int, total: int) -> None:
-            progress.update(bar, completed=n, total=total, text=f"{n}/{total}")
+            phases.show("data", n / total, f"{n}/{total}")
 
         classifiers = [name for name in names if any(stage.ranges for stage in stages_of(name, configs[name]))]
         native = all(VARIANTS[name].method(configs[name]).info.native for name in names)
@@ -114,36 +120,41 @@ def run_experiment(
         size = (dataset.info.width, dataset.info.height)
         configs = {name: dataclasses.replace(each, size=size) for name, each in configs.items()}
         config = configs[names[0]]
-        progress.update(bar, completed=1, total=1, text=f"{len(dataset.sequences)} sequences")
+        phases.show("data", 1.0, f"{len(dataset.sequences)} sequences")
         console.print(datasets.describe(dataset), soft_wrap=True)
-        check_scored(dataset, config)
+        check_dataset(names, configs, dataset)
+        initial = _initial(names, configs, dataset)
         out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "run.json", wanted)
+        write_json(out / "run.json", wanted)  # from here on there is something to resume
         lap("data")
 
-        trained = _train_all(names, configs, folders, dataset, eval_only, progress)
+        trained = _train_all(names, configs, folders, dataset, initial, eval_only, phases)
+        reports = stage_reports(trained)
         lap("training")
         # Of all sessions: the clock above saw only this one, which may have restored everything.
-        seconds["training"] = round(sum(stage["seconds"] for t in trained.values() for stage in t.report.values()), 1)
+        for part, key in {"compilation": "compile_seconds", "training": "seconds"}.items():
+            seconds[part] = round(sum(report[key] for report in reports.values()), 1)
 
-        bar = progress.add_task("evaluate", total=None, text="reading")
+        phases.show("tuning", text="reading")
         methods = [VARIANTS[row].method(config) for row in compared(names)]
         options = {"native": any(method.info.native for method in methods), "ranges": bool(classifiers)}
         validation, clips = (Clips(dataset, split, config.warmup, **options) for split in ("validation", "test"))
         runners, settings = make_runners(
-            names, config, trained, validation, out, lambda text: progress.update(bar, text=text)
+            names, config, trained, validation, out, lambda text: phases.show("tuning", text=text)
         )
+        phases.show("tuning", 1.0)
         del validation  # and the memory of what it kept
         lap("tuning")
-        progress.update(bar, total=len(runners) * len(clips), completed=0)
+        done = itertools.count()
         result = evaluate(
             runners,
             clips,
             pictures=config.pictures,
-            on_step=lambda text: progress.update(bar, advance=1, text=text),
+            on_step=lambda text: phases.show("evaluation", next(done) / (len(runners) * len(clips)), text),
         )
         classes = _evaluate_classes({name: runners[name] for name in classifiers}, configs, clips, out)
-        progress.update(bar, text="done")
+        dead = health.still_stages(reports) + _dead_methods(names, runners, trained, result["rows"], clips[0])
+        phases.show("evaluation", 1.0)
         lap("evaluation")
     metrics = {
         "schema": 1,
@@ -152,16 +163,22 @@ def run_experiment(
         "overrides": list(overrides),
         "configs": {name: dataclasses.asdict(each) for name, each in configs.items()},
         "dataset": datasets.describe(dataset),
-        "environment": environment(config, {name: found.report for name, found in trained.items()}),
+        "environment": environment(config, reports),
         "settings": {name: setting._asdict() for name, setting in settings.items()},
         "seconds": seconds,
+        "training": {stage: {**found, "terms": {}} for stage, found in reports.items()},
+        "dead": dead,
+        "warnings": health.few_steps(reports),
         "costs": costs(runners, dataset),
         "rows": result["rows"],
     }
     if classes:
         metrics["classes"] = classes
     references = table_references(runners, dataset.info.scale)
-    remarks = notes(names, dataset, [clips.outline(n) for n in range(len(clips))], settings, config)
+    remarks = [f"Dead network: {text}" for text in dead] + [f"Warning: {text}" for text in metrics["warnings"]]
+    remarks += health.training_note(reports)
+    urgent = len(dead) + len(metrics["warnings"])
+    remarks += notes(names, dataset, [clips.outline(n) for n in range(len(clips))], settings, config)
     remarks += [class_remark(name, scores) for name, scores in classes.items()]
     page = write_report(
         out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references
@@ -170,19 +187,21 @@ def run_experiment(
     metrics["seconds"] = {**seconds, "total": round(sum(seconds.values()), 1)}
     write_json(out / "metrics.json", metrics)
     print_table(metrics, references=references, console=console)
-    for remark in remarks:
-        console.print(remark, style="dim", markup=False, soft_wrap=True)
+    for number, remark in enumerate(remarks):
+        console.print(remark, style="yellow" if number < urgent else "dim", markup=False, soft_wrap=True)
     spent = ", ".join(f"{name} {value:.0f} s" for name, value in metrics["seconds"].items())
     console.print(f"{spent}\nmetrics: {out / 'metrics.json'}\nreport:  {page}", markup=False, soft_wrap=True)
     return metrics
 
 
-_COLUMNS = (
-    TextColumn("{task.description:<16}"),
-    BarColumn(),
-    TextColumn("{task.fields[text]}", markup=False),  # names of sequences may have brackets
-    TimeElapsedColumn(),
-)
+def _initial(names: Sequence[str], configs: Mapping[str, Config], dataset: Dataset) -> dict[str, PyTree]:
+    """The initial variables of each variant that is trained; what training would refuse is refused here."""
+    found: dict[str, PyTree] = {}
+    for name in names:
+        base, stages = trained_as(name), stages_of(name, configs[name])
+        if stages and base not in found:
+            found[base] = initial_variables(stages, dataset, configs[name])
+    return found
 
 
 def _train_all(
@@ -190,36 +209,78 @@ def _train_all(
     configs: Mapping[str, Config],
     folders: Mapping[str, Path],
     dataset: Dataset,
+    initial: Mapping[str, PyTree],
     eval_only: bool,
-    progress: Progress,
+    phases: Phases,
 ) -> dict[str, Trained]:
     """Train (or restore) each variant that ``names`` take their weights from, once."""
     trained: dict[str, Trained] = {}
-    bars: dict[str, Any] = {}
     for name in names:
         base, config = trained_as(name), configs[name]
-        stages = stages_of(name, config)
-        if base in trained or not stages:
+        if base in trained or base not in initial:
             continue
-        if not config.vgg and any(stage.vgg for stage in stages):
-            progress.console.print(
-                "VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on.",
-                soft_wrap=True,
-            )
-
-        def on_step(stage: str, step: int, fraction: float, terms: dict[str, float], base: str = base) -> None:
-            label = stage if len(names) == 1 else f"{base}: {stage}"
-            if label not in bars:
-                bars[label] = progress.add_task(f"train {label}", total=1.0, text="")
-            progress.update(bars[label], completed=fraction, text=f"step {step}, loss {terms['loss']:.4f}")
-
-        folder = folders[name]
+        stages, folder = stages_of(name, config), folders[name]
         if eval_only:
-            variables, report = restore_stages(stages, dataset, config, folder)
+            variables, report = restore_stages(stages, folder, initial[base])
         else:
-            variables, report = train_stages(stages, dataset, config, folder, on_step)
-        trained[base] = Trained(variables, config, report)
+            if not config.vgg and any(stage.vgg for stage in stages):
+                phases.console.print(
+                    "VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on.",
+                    soft_wrap=True,
+                )
+            shown = _TrainingProgress(phases, "" if len(names) == 1 else f"{base}: ")
+            variables, report = train_stages(
+                stages, dataset, config, folder, initial[base], shown.on_step, shown.on_compile
+            )
+        trained[base] = Trained(initial[base], variables, config, report)
     return trained
+
+
+class _TrainingProgress:
+    """Shows the steps of stages; says at once where the gradient stays zero."""
+
+    def __init__(self, phases: Phases, prefix: str):
+        self.phases, self.prefix, self.still = phases, prefix, 0
+
+    def on_compile(self, stage: str) -> None:
+        self.still = 0
+        self.phases.show(f"train {self.prefix}{stage}", text="compiling (the clock of the training waits)")
+
+    def on_step(self, stage: str, step: int, fraction: float, terms: dict[str, float]) -> None:
+        self.still = 0 if terms["gradient_norm"] else self.still + 1
+        self.phases.show(f"train {self.prefix}{stage}", fraction, f"step {step}, loss {terms['loss']:.4f}")
+        if self.still == health.STILL_STEPS:
+            self.phases.console.print(
+                f"Dead network: {self.prefix}{stage}: the gradient is exactly zero since step "
+                f"{step - self.still + 1}. A smaller learning rate may keep it alive.", style="red", soft_wrap=True,
+            )  # fmt: skip
+
+
+def stage_reports(trained: Mapping[str, Trained]) -> dict[str, dict[str, Any]]:
+    """Stage -> what training it gave; of several variants "variant/stage"."""
+    return {
+        stage if len(trained) == 1 else f"{base}/{stage}": report
+        for base, found in trained.items()
+        for stage, report in found.report.items()
+    }
+
+
+def _dead_methods(
+    names: Sequence[str],
+    runners: Mapping[str, Runner],
+    trained: Mapping[str, Trained],
+    rows: Sequence[Mapping[str, Any]],
+    clip: Clip,
+) -> list[str]:
+    """A message for each method whose pictures say that its network does nothing."""
+    owners = {row: owner_of(row, names, trained) for row in runners}
+    learned = {base for base, found in trained.items() if not health.has_few_steps(found.report)}
+    messages = health.same_rows(rows, {row: owner if owner in learned else None for row, owner in owners.items()})
+    for row in names:
+        owner = owners.get(row)
+        if owner:
+            messages += health.unchanged(row, runners[row], trained[owner].initial, clip)
+    return messages
 
 
 def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str, Any]]:
@@ -256,13 +317,6 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def environment(config: Config, reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Commit, device, versions, seed and steps (stage -> steps; of several variants "variant/stage" -> steps)."""
-    return {
-        **machine.environment(),
-        "seed": config.seed,
-        "steps": {
-            stage if len(reports) == 1 else f"{name}/{stage}": found["steps"]
-            for name, report in reports.items()
-            for stage, found in report.items()
-        },
-    }
+    """Commit, device, versions, seed and the steps of each stage in ``reports``."""
+    steps = {stage: found["steps"] for stage, found in reports.items()}
+    return {**machine.environment(), "seed": config.seed, "steps": steps}

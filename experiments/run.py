@@ -3,8 +3,9 @@
 import argparse
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.text import Text
@@ -41,7 +42,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2, a signal 130."""
+    """Run the command; bad input prints one line and returns 2, a signal 130, a run with a dead network 1."""
     options = parse(arguments)
     return guarded(lambda console: _run(options, console))
 
@@ -65,6 +66,13 @@ def guarded(command: Callable[[Console], int]) -> int:
 def print_error(error: Exception, console: Console, label: str = "Error") -> None:
     """One line; brackets in the message are no markup."""
     console.print(Text.assemble((f"{label}:", "red"), f" {error}"), soft_wrap=True)
+
+
+def exit_code(metrics: Mapping[str, Any], console: Console) -> int:
+    """0, or 1 after a last line for each dead network of a run."""
+    for text in metrics["dead"]:
+        console.print(Text.assemble(("Dead network:", "red"), f" {text}"), soft_wrap=True)
+    return 1 if metrics["dead"] else 0
 
 
 def print_variants(console: Console) -> int:
@@ -95,11 +103,11 @@ def _run(options: argparse.Namespace, console: Console) -> int:
         return write_profile(name, config, out, console)
     wanted = {"variant": name, "data": options.data, **dataclasses.asdict(config)}
     check_folder(out, wanted, resume=options.resume, eval_only=options.eval_only)
-    run_experiment(
+    metrics = run_experiment(
         [name], {name: config}, {name: out}, preset=options.preset, overrides=options.overrides, data=options.data,
         out=out, wanted=wanted, eval_only=options.eval_only, console=console,
     )  # fmt: skip
-    return 0
+    return exit_code(metrics, console)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,15 @@ from essjax.data import CachedSource, Rounds, clips, disk_source
 from essjax.data.layout import Dataset
 from essjax.frames import select_time
 from essjax.generate import RENDERER, live_source
-from essjax.train import Checkpoints, create_state, learning_rate, make_train_step, optimizer, train
+from essjax.train import (
+    Checkpoints,
+    create_state,
+    learning_rate,
+    make_train_step,
+    optimizer,
+    read_progress,
+    train,
+)
 from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.datasets import render_settings, train_clips
@@ -23,6 +31,44 @@ from experiments.variants.base import Stage
 MIN_CROP = 24
 OnStep = Callable[[str, int, float, dict[str, float]], None]
 """Called with stage, step, progress in [0, 1] and the terms."""
+OnCompile = Callable[[str], None]
+"""Called with the stage whose step is about to be compiled."""
+
+
+def check_crop(config: Config, width: int, height: int) -> tuple[int, int]:
+    """Width and height of the crops that are cut out of frames of ``width`` x ``height``.
+
+    Raises:
+      ValueError: they are too small.
+    """
+    crop = min(config.crop[0], width), min(config.crop[1], height)
+    if min(crop) < MIN_CROP:
+        raise ValueError(
+            f"crop: expected at least {MIN_CROP}x{MIN_CROP} LR pixels (FRNet's coarsest features are an eighth), "
+            f"got {crop[0]}x{crop[1]} from crop {config.crop} of {width}x{height} frames."
+        )
+    return crop
+
+
+def check_batches(dataset: Dataset, config: Config, stage: Stage) -> None:
+    """Refuse what ``make_batches`` would, without reading a frame.
+
+    Raises:
+      ValueError: no sequence is long enough for a clip, the crop is too small, or ``fresh`` with imported data.
+    """
+    if config.fresh is not None and dataset.source.get("renderer") != RENDERER:
+        raise ValueError(
+            f"--set fresh={config.fresh}: {dataset.path} was not made by the built-in renderer, so there are no new "
+            "scenes of it. Leave fresh away, or train on the built-in scenes (no --data)."
+        )
+    clips(disk_source(dataset, "train", ranges=stage.ranges, memory=0), **_cut(dataset, config, stage))
+
+
+def _cut(dataset: Dataset, config: Config, stage: Stage) -> dict[str, Any]:
+    """How clips are cut, for ``data.clips``."""
+    width, height = check_crop(config, dataset.info.width, dataset.info.height)
+    longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
+    return {"length": min(config.clip, longest), "batch": stage.batch, "crop": (height, width)}
 
 
 def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: int = 4):
@@ -32,18 +78,10 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: in
     trained on. ``prefetch`` batches are held ready.
 
     Raises:
-      ValueError: no sequence is long enough for a clip, the crop is too small, or ``fresh`` with imported data.
+      ValueError: see ``check_batches``.
     """
-    info = dataset.info
-    width, height = (min(a, b) for a, b in zip(config.crop, (info.width, info.height), strict=True))
-    if min(width, height) < MIN_CROP:
-        raise ValueError(
-            f"crop: expected at least {MIN_CROP}x{MIN_CROP} LR pixels (FRNet's coarsest features are an eighth), "
-            f"got {width}x{height} from crop {config.crop} of {info.width}x{info.height} frames."
-        )
-    longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
-    length = min(config.clip, longest)
-    cut = {"length": length, "batch": stage.batch, "crop": (height, width), "prefetch": prefetch}
+    check_batches(dataset, config, stage)
+    cut = {**_cut(dataset, config, stage), "prefetch": prefetch}
 
     def make(number: int):
         source = disk_source(dataset, "train", ranges=stage.ranges) if number == 0 else fresh(number)
@@ -51,16 +89,9 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: in
 
     def fresh(number: int) -> CachedSource:
         settings = {**render_settings(config), "ranges": stage.ranges}
-        return live_source(train_clips(config, number), info.width, info.height, **settings)
+        return live_source(train_clips(config, number), dataset.info.width, dataset.info.height, **settings)
 
-    if config.fresh is None:
-        return make(0)
-    if dataset.source.get("renderer") != RENDERER:
-        raise ValueError(
-            f"--set fresh={config.fresh}: {dataset.path} was not made by the built-in renderer, so there are no new "
-            "scenes of it. Leave fresh away, or train on the built-in scenes (no --data)."
-        )
-    return Rounds(make, config.fresh)
+    return make(0) if config.fresh is None else Rounds(make, config.fresh)
 
 
 def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> PyTree:
@@ -72,14 +103,20 @@ def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> 
 
 
 def train_stages(
-    stages: list[Stage], dataset: Dataset, config: Config, out: Path, on_step: OnStep
+    stages: list[Stage],
+    dataset: Dataset,
+    config: Config,
+    out: Path,
+    variables: PyTree,
+    on_step: OnStep,
+    on_compile: OnCompile = lambda stage: None,
 ) -> tuple[PyTree, dict[str, Any]]:
-    """Train all stages in order; one with a checkpoint at the end of its budget is only restored.
+    """Train all stages in order, from ``variables``; one with a checkpoint at the end of its budget is only restored.
 
     Returns:
-      The variables, and stage -> ``{"steps", "seconds", "terms"}``.
+      The variables, and stage -> what ``train`` says of it.
     """
-    variables, report = initial_variables(stages, dataset, config), {}
+    report = {}
     for stage in stages:
         transform = optimizer()
         # A stage sees only its own method's variables: a later stage's are not touched (nor saved) by an earlier one.
@@ -96,7 +133,8 @@ def train_stages(
                 stage.budget,
                 functools.partial(learning_rate, peak=stage.learning_rate, decay=stage.decay),
                 save_every=config.save_every,
-                on_step=lambda step, progress, terms, name=stage.name: on_step(name, step, progress, terms),
+                on_step=functools.partial(on_step, stage.name),
+                on_compile=functools.partial(on_compile, stage.name),
             )
         finally:
             checkpoints.close()
@@ -104,16 +142,21 @@ def train_stages(
     return variables, report
 
 
-def restore_stages(stages: list[Stage], dataset: Dataset, config: Config, out: Path) -> tuple[PyTree, dict[str, Any]]:
+def restore_stages(stages: list[Stage], out: Path, variables: PyTree) -> tuple[PyTree, dict[str, Any]]:
     """The variables of the stages' newest checkpoints, for ``--eval-only``, and how they were trained.
 
+    Args:
+      stages: of a variant.
+      out: where it was trained.
+      variables: the initial ones.
+
     Returns:
-      The variables, and stage -> ``{"steps", "seconds", "terms"}`` as ``train_stages`` gave them, without terms.
+      The variables, and stage -> what ``train`` said of it, without terms.
 
     Raises:
       ValueError: a stage has no checkpoint, or one that does not fit the settings.
     """
-    variables, report = initial_variables(stages, dataset, config), {}
+    report = {}
     for stage in stages:
         folder = out / "checkpoints" / stage.name
         if not folder.is_dir() or not os.listdir(folder):
@@ -127,7 +170,7 @@ def restore_stages(stages: list[Stage], dataset: Dataset, config: Config, out: P
         finally:
             checkpoints.close()
         variables = {**variables, **state.variables}
-        report[stage.name] = {"steps": int(state.step), "seconds": saved["seconds"], "terms": {}}
+        report[stage.name] = {**read_progress(saved), "steps": int(state.step), "terms": {}}
     return variables, report
 
 

@@ -1,7 +1,7 @@
 """Training: objectives, one jitted step, the loop, checkpoints."""
 
 from essjax.train.checkpoint import Checkpoints
-from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, train
+from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, read_progress, train
 from essjax.train.objectives import (
     Objective,
     Recurrent,
@@ -25,5 +25,6 @@ __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "Recurrent", "TrainState", "both_kinds",
     "classification_objective", "composition_objective", "constant", "cosine", "create_state", "dlctus_objective",
     "extranet_objective", "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective",
-    "learning_rate", "make_train_step", "nsrr_objective", "odd_length", "optimizer", "predict_last", "train",
+    "learning_rate", "make_train_step", "nsrr_objective", "odd_length", "optimizer", "predict_last", "read_progress",
+    "train",
 ]  # fmt: skip

@@ -1,4 +1,7 @@
-"""The training loop: a budget in steps or seconds, checkpoints, exact resumption, a stop on signals and on NaN."""
+"""The training loop: a budget in steps or seconds, checkpoints, exact resumption, a stop on signals and on NaN.
+
+The clock counts training: a step with the wait for its batch, but neither compilation nor saving.
+"""
 
 import json
 import signal
@@ -51,11 +54,13 @@ def train(
     *,
     save_every: float = 30.0,
     on_step: Callable[[int, float, dict[str, float]], None] = lambda step, progress, terms: None,
+    on_compile: Callable[[], None] = lambda: None,
 ) -> tuple[TrainState, dict[str, Any]]:
     """Run a stage to the end of its budget, from its newest checkpoint if there is one.
 
     Args:
-      step_function: from ``make_train_step``.
+      step_function: from ``make_train_step``, or what its ``lower(...).compile()`` gave for these shapes; it is
+        compiled before the clock starts.
       state: the state at step 0; the checkpoint's replaces it.
       batches: a grain iterator: ``next``, ``get_state``, ``set_state``.
       checkpoints: where the state is kept.
@@ -64,46 +69,65 @@ def train(
       schedule: learning rate of step and progress in [0, 1].
       save_every: seconds between checkpoints.
       on_step: called with step, progress and the terms of that step.
+      on_compile: called before the step is compiled, if it has to be.
 
     Returns:
-      The final state and ``{"steps", "seconds", "terms"}``.
+      The final state and a summary of all runs together: ``steps``; ``seconds`` of training; ``compile_seconds``;
+      ``still``, how many steps up to the last had a gradient of exactly zero; ``terms`` of the last step.
 
     Raises:
       Interrupted: a signal came; everything is saved.
       NonFiniteLoss: names the terms; the batch is in ``log_path``'s folder.
     """
-    seconds = 0.0
+    spent = read_progress({})
     if checkpoints.latest() is not None:
         state, saved = checkpoints.restore(state)
-        seconds = saved["seconds"]
+        spent = read_progress(saved)
         batches.set_state(saved["batches"])  # type: ignore[attr-defined]
     step, terms = int(state.step), {}
     _truncate(log_path, step)
     last_save = time.monotonic()
-    started = last_save - seconds
     with _SignalFlag() as stop, log_path.open("a") as log:
 
         def save():
-            progress = {"seconds": seconds, "batches": batches.get_state()}  # type: ignore[attr-defined]
             log.flush()
-            checkpoints.save(step, state, progress)
+            checkpoints.save(step, state, {**spent, "batches": batches.get_state()})  # type: ignore[attr-defined]
 
-        while budget.progress(step, seconds) < 1.0 and not stop.set:
-            batch = next(batches)
-            state, terms = step_function(state, batch, schedule(step, budget.progress(step, seconds)))
+        def progress() -> float:
+            return budget.progress(step, spent["seconds"])
+
+        while progress() < 1.0 and not stop.set:
+            began = time.monotonic()
+            batch, rate = next(batches), schedule(step, progress())
+            if hasattr(step_function, "lower"):
+                on_compile()
+                began = time.monotonic()
+                step_function = step_function.lower(state, batch, rate).compile()
+                spent["compile_seconds"] += time.monotonic() - began
+                began = time.monotonic()
+            state, terms = step_function(state, batch, rate)
             terms = {name: float(value) for name, value in jax.device_get(terms).items()}
-            step, seconds = step + 1, time.monotonic() - started
+            step, spent["seconds"] = step + 1, spent["seconds"] + time.monotonic() - began
             if not all(np.isfinite(value) for value in terms.values()):
                 _raise_non_finite(step, terms, batch, log_path.parent)
-            log.write(json.dumps({"step": step, "seconds": round(seconds, 2), **terms}) + "\n")
-            on_step(step, budget.progress(step, seconds), terms)
+            spent["still"] = 0 if terms["gradient_norm"] else spent["still"] + 1
+            log.write(json.dumps({"step": step, "seconds": round(spent["seconds"], 2), **terms}) + "\n")
+            on_step(step, progress(), terms)
             if time.monotonic() - last_save > save_every:
                 save()
                 last_save = time.monotonic()
         save()
-        if stop.set and budget.progress(step, seconds) < 1.0:
+        if stop.set and progress() < 1.0:
             raise Interrupted(f"stopped at step {step}; the state is saved. Run the same command with --resume.")
-    return state, {"steps": step, "seconds": seconds, "terms": terms}
+    return state, {"steps": step, **spent, "terms": terms}
+
+
+def read_progress(saved: dict[str, Any]) -> dict[str, Any]:
+    """``seconds``, ``compile_seconds`` and ``still`` of a checkpoint's progress, see ``train``; zero where absent."""
+    return {name: saved.get(name, nothing) for name, nothing in _NOTHING.items()}
+
+
+_NOTHING = {"seconds": 0.0, "compile_seconds": 0.0, "still": 0}
 
 
 def _raise_non_finite(step: int, terms: dict[str, float], batch: Any, folder: Path) -> None:

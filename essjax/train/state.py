@@ -87,7 +87,7 @@ def learning_rate(
 ) -> float:
     """Learning rate: linear warm-up over the first steps, times ``peak``, times the decay at this progress.
 
-    The warm-up counts steps because on a clock the first step is mostly compilation.
+    The warm-up counts steps: Adam's averages need so many, whatever the machine.
 
     Args:
       step: steps taken.

@@ -8,7 +8,8 @@ import pytest
 
 from essjax.data.layout import Dataset, Segment, SequenceInfo
 from experiments import compare, run
-from experiments.comparison import _read_settings, check_scored
+from experiments.checks import check_scored
+from experiments.comparison import _read_settings
 from experiments.config import make_config
 from experiments.experiment import check_folder, default_folder
 

@@ -1,8 +1,11 @@
 """The run command end to end, small: two methods beside ExtraSS, one family, a handful of steps."""
 
+import contextlib
 import dataclasses
 import functools
+import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,16 +13,26 @@ import pytest
 from experiments import compare, comparison, datasets, run, variants
 
 
+class Finished(tuple):
+    """Folder, exit code and overrides of a run, and what it printed."""
+
+    def __new__(cls, values, printed):
+        found = super().__new__(cls, values)
+        found.printed = printed
+        return found
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A finished run: its folder and its exit code."""
+    """A finished run."""
     out = tmp_path_factory.mktemp("run") / "out"
     patch = pytest.MonkeyPatch()
     patch.setattr(variants, "BASELINES", ("extrass-w", "bilinear"))
     patch.setattr(datasets, "plan", functools.partial(datasets.plan, families=["carousel"]))
     overrides = ["test_frames=7", "train_frames=5", "first_steps=2", "steps=2", "size=[32,24]", "crop=[32,24]"]
-    code = run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides])
-    yield out, code, overrides
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        code = run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides])
+    yield Finished((out, code, overrides), output.getvalue())
     patch.undo()
 
 
@@ -32,7 +45,10 @@ def test_metrics_json(finished):
     assert metrics["overrides"] == overrides
     assert metrics["configs"]["extrass"]["size"] == [32, 24] and metrics["configs"]["extrass"]["width"] == 8
     assert {"commit", "device", "versions", "seed"} <= set(metrics["environment"])
-    assert set(metrics["seconds"]) == {"data", "training", "tuning", "evaluation", "report", "total"}
+    phases = {"data", "compilation", "training", "tuning", "evaluation", "report", "total"}
+    assert set(metrics["seconds"]) == phases and metrics["seconds"]["compilation"] > 0
+    assert {stage: found["steps"] for stage, found in metrics["training"].items()} == metrics["environment"]["steps"]
+    assert metrics["dead"] == [] and len(metrics["warnings"]) == 2
     means = {(r["method"], r["frames"], r["resolution"]): r for r in metrics["rows"] if r["sequence"] == "mean"}
     assert set(means) == {
         ("extrass", "ss", "hr"), ("extrass", "ess", "hr"), ("bilinear", "ss", "hr"),
@@ -46,6 +62,21 @@ def test_the_report_shows_every_method(finished):
     page = (out / "report" / "index.html").read_text()
     assert all(name in page for name in ("extrass", "extrass-w", "extrass-e", "bilinear"))
     assert list((out / "report" / "sheets").glob("*.png"))
+
+
+def test_report_and_output_say_how_long_it_trained(finished):
+    out, _, _ = finished
+    page, printed = (out / "report" / "index.html").read_text(), finished.printed
+    for text in (page, printed):
+        assert "Warning: frnet made only 2 steps: too few to learn much" in text
+        assert re.search(r"Training: frnet 2 steps in \d+ s \(compiled in \d+ s\); extrassnet 2 steps", text)
+    for phase in (
+        "data: 100 % 3 sequences",
+        "train frnet: compiling",
+        "train extrassnet: 100 % step 2",
+        "evaluation: 100 %",
+    ):
+        assert re.search(rf"^ *\d+:\d\d {phase}", printed, re.MULTILINE), phase
 
 
 def test_the_log_has_a_line_per_step(finished):
@@ -93,6 +124,10 @@ def test_a_crop_that_is_too_small(finished, tmp_path, capsys):
     arguments = ["--preset", "smoke", "--data", str(out / "scenes"), "--out", str(tmp_path / "out"), "--set", *settings]
     assert run.main(arguments) == 2
     assert "crop: expected at least 24x24 LR pixels" in capsys.readouterr().out.replace("\n", " ")
+    assert not (tmp_path / "out").exists()  # what was refused does not stand in the way
+    assert run.main([*arguments[:2], *arguments[4:]]) == 2  # the built-in scenes: before they are rendered
+    assert "got 32x16 from crop (32, 16) of 48x28 frames" in capsys.readouterr().out.replace("\n", " ")
+    assert not (tmp_path / "out").exists()
 
 
 def test_list_names_all_variants(capsys):

@@ -109,31 +109,91 @@ def test_finished_stage_is_only_restored(tmp_path, uninterrupted):
     assert summary["steps"] == tiny_run.STEPS
 
 
-def test_clock_ends_a_stage(tmp_path):
-    _, summary = tiny_run.run(
-        tmp_path, budget=Budget(None, 0.4), on_step=lambda step, progress, terms: time.sleep(0.05)
-    )
-    assert 1 <= summary["steps"] <= 9 and 0.4 <= summary["seconds"] < 5.0
+class Batches:
+    """The tiny batches, each after a pause in seconds."""
 
-
-class Poisoned:
-    """The tiny batches, with NaN in the reference of batch ``bad`` (counted from 1)."""
-
-    def __init__(self, bad):
-        self.bad, self.count, self.batches = bad, 0, tiny_run.tiny_batches()
+    def __init__(self, pause=0.0):
+        self.pause, self.batches = pause, tiny_run.tiny_batches()
 
     def __next__(self):
-        self.count += 1
-        batch = next(self.batches)
-        if self.count == self.bad:
-            batch.reference[1, 0, 2, 3, 0] = np.nan
-        return batch
+        time.sleep(self.pause)
+        return next(self.batches)
 
     def get_state(self):
         return self.batches.get_state()
 
     def set_state(self, state):
         self.batches.set_state(state)
+
+
+def test_clock_ends_a_stage(tmp_path):
+    _, summary = tiny_run.run(tmp_path, budget=Budget(None, 0.4), batches=Batches(0.05))
+    assert 1 <= summary["steps"] <= 9 and 0.4 <= summary["seconds"] < 5.0
+
+
+class SlowToCompile:
+    """The tiny step, whose compilation takes ``seconds``."""
+
+    def __init__(self, seconds):
+        self.seconds = seconds
+
+    def lower(self, *arguments):
+        self.lowered = tiny_run.tiny_step().lower(*arguments)
+        return self
+
+    def compile(self):
+        time.sleep(self.seconds)
+        return self.lowered.compile()
+
+
+def test_the_clock_counts_neither_compilation_nor_saving(tmp_path):
+    """A budget shorter than the compilation still gives as many steps as fit into it; so does one that is resumed."""
+    events = []
+    options = {
+        "batches": Batches(0.02), "step": SlowToCompile(0.6), "on_compile": lambda: events.append("compile"),
+        "on_step": lambda step, progress, terms: (events.append(step), time.sleep(0.1)),
+    }  # fmt: skip
+    _, first = tiny_run.run(tmp_path, budget=Budget(3, 0.5), **options)
+    assert events == ["compile", 1, 2, 3] and first["seconds"] < 0.5 and first["compile_seconds"] > 0.6
+    _, second = tiny_run.run(tmp_path, budget=Budget(5, 0.5), **options)
+    assert events[4:] == ["compile", 4, 5] and first["seconds"] < second["seconds"] < 0.5
+    assert second["compile_seconds"] > first["compile_seconds"] + 0.6
+    _, third = tiny_run.run(tmp_path, budget=Budget(5, 0.5), **options)  # at its end: nothing is compiled
+    assert len(events) == 7 and {**third, "terms": second["terms"]} == second
+
+
+def test_a_compiled_step_is_taken_as_it_is(tmp_path, uninterrupted):
+    batch = next(tiny_run.tiny_batches())
+    compiled = tiny_run.tiny_step().lower(tiny_run.initial_state(), batch, 0.1).compile()
+    state, summary = tiny_run.run(tmp_path, step=compiled, on_compile=lambda: pytest.fail("it compiled"))
+    assert_same_run(tmp_path, state, uninterrupted)
+    assert summary["compile_seconds"] == 0.0
+
+
+def test_steps_without_a_gradient_are_counted_across_a_stop(tmp_path):
+    """The gradient is zero in the first 4 steps, then not, then again from step 8 on; runs end at 4, 6, 10 and 12."""
+
+    def step(state, batch, rate):
+        state, terms = tiny_run.tiny_step()(state, batch, rate)
+        return state, {**terms, "gradient_norm": 1e-30 if 5 <= int(state.step) <= 7 else 0.0}
+
+    found = [tiny_run.run(tmp_path, step=step, budget=Budget(n, None))[1]["still"] for n in (4, 6, 10, 12)]
+    assert found == [4, 0, 3, 5]
+
+
+class Poisoned(Batches):
+    """The tiny batches, with NaN in the reference of batch ``bad`` (counted from 1)."""
+
+    def __init__(self, bad):
+        super().__init__()
+        self.bad, self.count = bad, 0
+
+    def __next__(self):
+        self.count += 1
+        batch = super().__next__()
+        if self.count == self.bad:
+            batch.reference[1, 0, 2, 3, 0] = np.nan
+        return batch
 
 
 def test_non_finite_loss_names_the_term_and_saves_the_batch(tmp_path):

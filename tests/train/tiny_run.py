@@ -54,14 +54,14 @@ def tiny_batches(seed=0):
     return iter(clips(sequences(), length=3, batch=2, crop=(3, 4), seed=seed, threads=1, prefetch=1))
 
 
-def run(folder, *, budget=None, save_every=1e9, on_step=lambda step, progress, terms: None, batches=None):
+def run(folder, *, step=None, budget=None, save_every=1e9, batches=None, **callbacks):
     """Train in ``folder`` from its newest checkpoint, if any."""
     checkpoints = Checkpoints(Path(folder) / "checkpoints")
     try:
         return train(
-            tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
+            step or tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
             budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), save_every=save_every,
-            on_step=on_step,
+            **callbacks,
         )  # fmt: skip
     finally:
         checkpoints.close()

@@ -1,0 +1,105 @@
+"""What is refused before anything is rendered, read or trained: settings and data that do not fit together."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from essjax.data import Dataset, Segment
+from essjax.interfaces import MethodInfo
+from essjax.scenes import make_scene
+from experiments.config import Config
+from experiments.datasets import scene_clips
+from experiments.evaluate import scored_frames
+from experiments.training import check_batches, check_crop
+from experiments.variants import VARIANTS, stages_of
+
+
+def check_settings(names: Sequence[str], configs: Mapping[str, Config]) -> None:
+    """Refuse settings that the built-in scenes cannot be trained or scored with; nothing is rendered for it.
+
+    Raises:
+      ValueError: the crop is too small, a variant has another scale, or a sequence has no frame that is scored.
+    """
+    for name in names:
+        config = configs[name]
+        if stages_of(name, config):
+            check_crop(config, *config.size)
+        reason = unfit_scale(VARIANTS[name].method(config).info, config.scale)
+        if reason:
+            raise ValueError(f"{name}: {reason}. Set scale, or leave it out.")
+    config = configs[names[0]]
+    clips = scene_clips(config)
+    for split in scored_splits(config):
+        cuts = {clip.name: make_scene(clip.family, clip.seed, clip.frames).cut for clip in clips if clip.split == split}
+        empty = [name for name, cut in cuts.items() if not scored_frames(cut, [True] * len(cut), config.warmup)]
+        _refuse_empty("the built-in scenes", split, empty, config)
+
+
+def check_dataset(names: Sequence[str], configs: Mapping[str, Config], dataset: Dataset) -> None:
+    """Refuse data that the variants cannot be trained on or scored with, from its records alone.
+
+    Raises:
+      ValueError: a sequence has no frame that is scored, a variant needs buffers, a scale or frames that the data
+        lacks, or no clip can be cut out of it.
+    """
+    check_scored(dataset, configs[names[0]])
+    for name in names:
+        reason = unfit(
+            VARIANTS[name].method(configs[name]).info, {"motion", *dataset.info.channels}, dataset.info.scale
+        )
+        if reason:
+            raise ValueError(f"{dataset.path}: {name} cannot run on it: {reason}. Leave it out, or import more.")
+        for stage in stages_of(name, configs[name]):
+            check_batches(dataset, configs[name], stage)
+
+
+def check_scored(dataset: Dataset, config: Config) -> None:
+    """Refuse data with sequences of which no frame is scored, before anything is trained.
+
+    Raises:
+      ValueError: a test sequence, or a validation sequence where methods are tuned on them, is all warm-up.
+    """
+    for split in scored_splits(config):
+        empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, config)]
+        _refuse_empty(dataset.path, split, empty, config)
+
+
+def scored_splits(config: Config) -> tuple[str, ...]:
+    """Splits whose frames are scored in a run."""
+    return ("validation", "test") if config.tune else ("test",)
+
+
+def _has_scored(dataset: Dataset, segment: Segment, config: Config) -> bool:
+    """What ``load_clip`` will find, without reading an image."""
+    cuts = {record["number"]: record["cut"] for record in dataset.sequences[segment.sequence].frames}
+    numbers = dataset.numbers(segment)
+    return bool(scored_frames([cuts[n] for n in numbers], dataset.scored(segment), config.warmup))
+
+
+def _refuse_empty(where: str | Path, split: str, empty: Sequence[str], config: Config) -> None:
+    if empty:
+        raise ValueError(
+            f"{where}, split {split}: expected frames to score in every sequence, got none in "
+            f"{', '.join(empty)}: all are among the {config.warmup} that warm up at the start and after a cut. "
+            "Give longer sequences, or fewer frames to warm up with --set warmup=N."
+        )
+
+
+def unfit(info: MethodInfo, images: Iterable[str], scale: int) -> str:
+    """Why a method cannot be run and scored on frames that hold ``images``, or an empty string.
+
+    Args:
+      info: of the method.
+      images: names of what a frame holds.
+      scale: reference size over frame size.
+    """
+    missing = sorted(info.requires - set(images))
+    if missing:
+        return f"this dataset has no {', '.join(missing)}"
+    return unfit_scale(info, scale)
+
+
+def unfit_scale(info: MethodInfo, scale: int) -> str:
+    """Why the scale of a method is not that of the data, or an empty string."""
+    if info.scale not in (1, scale):
+        return f"it enlarges {info.scale:g} times, this dataset's reference is {scale} times larger"
+    return ""

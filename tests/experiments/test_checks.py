@@ -1,0 +1,72 @@
+"""Everything that can be refused is refused before a frame is rendered, and leaves nothing behind."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from essjax.data import write_dataset, write_sequence
+from experiments import run
+from experiments.checks import check_settings
+from experiments.config import PRESETS, make_config
+from experiments.variants import config_of
+from tests.helpers import make_sequence
+
+
+def printed(capsys):
+    return capsys.readouterr().out.replace("\n", " ")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_has_frames_to_score(preset):
+    check_settings(["extrass"], {"extrass": config_of("extrass", preset, ["test_sequences=4"])})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["warmup=5"], "the built-in scenes, split test: expected frames to score in .*, got none in test-cuts-"),
+        (["tune=true", "warmup=6", "test_frames=40", "train_frames=6"], "validation: .* got none in validation-corrid"),
+        (["crop=[32,20]"], r"crop: expected at least 24x24 LR .* got 32x20 from crop \(32, 20\) of 48x28 frames"),
+        (["size=[40,20]"], "got 32x20 from crop"),
+    ],
+)  # fmt: skip
+def test_settings_are_refused_before_anything_is_rendered(overrides, message, tmp_path, capsys):
+    with pytest.raises(ValueError, match=message):
+        check_settings(["extrass"], {"extrass": make_config("smoke", overrides)})
+    assert run.main(["--preset", "smoke", "--out", str(tmp_path / "out"), "--set", *overrides]) == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_crop_is_of_no_matter_where_nothing_is_trained():
+    check_settings(["taau"], {"taau": make_config("smoke", ["crop=[8,8]"])})
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    """A dataset without normals and base colour, at twice the size, of 5 frames."""
+    folder = tmp_path_factory.mktemp("imported")
+    sequence = jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), make_sequence(0, 5, 1, 24, 32))
+    gbuffers = dataclasses.replace(sequence.frames.gbuffers, normal=None, base_color=None)
+    sequence = dataclasses.replace(sequence, frames=dataclasses.replace(sequence.frames, gbuffers=gbuffers))
+    write_sequence(folder, "a", sequence)
+    write_dataset(folder, {split: ["a"] for split in ("train", "validation", "test")})
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--variant", "extrass"], "extrass cannot run on it: this dataset has no base_color, normal."),
+        (["--variant", "nsrr", "--set", "scale=4"], "nsrr cannot run on it: it enlarges 4 times, this dataset's"),
+        (["--variant", "nsrr", "--set", "fresh=3"], "was not made by the built-in renderer"),
+        (["--variant", "nsrr", "--set", "crop=[24,16]"], "got 24x16 from crop (24, 16) of 32x24 frames"),
+        (["--variant", "nsrr", "--set", "warmup=5"], "expected frames to score in every sequence, got none in a"),
+    ],
+)
+def test_data_is_refused_before_the_folder_is_taken(imported, arguments, message, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run.main(["--preset", "smoke", "--data", str(imported), "--out", str(out), *arguments]) == 2
+    assert message in printed(capsys)
+    assert not out.exists()
