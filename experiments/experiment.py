@@ -273,9 +273,11 @@ def _dead_methods(
     clip: Clip,
 ) -> list[str]:
     """A message for each method whose pictures say that its network does nothing."""
-    owners = {row: owner_of(row, names, trained) for row in runners}
+    # After a few steps hardly anything is seen; that they were few is said.
     learned = {base for base, found in trained.items() if not health.has_few_steps(found.report)}
-    messages = health.same_rows(rows, {row: owner if owner in learned else None for row, owner in owners.items()})
+    owners = {row: owner_of(row, names, trained) for row in runners}
+    owners = {row: owner if owner in learned else None for row, owner in owners.items()}
+    messages = health.same_rows(rows, owners)
     for row in names:
         owner = owners.get(row)
         if owner:
