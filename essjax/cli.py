@@ -75,7 +75,8 @@ def _print_dataset(dataset: Dataset) -> None:
         for segment in segments:
             table.add_row(split, segment.sequence, f"{segment.first}-{segment.last}", str(segment.score_from))
     _console.print(table)
-    extra = ("; native frames" if info.native else "") + ("; sample ranges" if info.ranges else "")
+    native = [split for split in dataset.splits if dataset.has_native(split)]
+    extra = (f"; native frames ({', '.join(native)})" if native else "") + ("; sample ranges" if info.ranges else "")
     _console.print(f"buffers: {', '.join(info.channels)}{extra}")
 
 
@@ -114,8 +115,8 @@ def scenes(
     """
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None
-    clips = plan(split, sequences, frames, spp=spp, families=chosen, start=seed)
-    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+    clips = plan(split, sequences, frames, spp=spp, native=native, families=chosen, start=seed)
+    settings = {"scale": scale, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
     with progress_bar("rendering") as progress:
         dataset = generate(out, clips, width, height, progress=progress, **settings)
     _print_dataset(dataset)

@@ -27,6 +27,7 @@ class Clip(NamedTuple):
       seed: of the scene.
       frames: how many.
       spp: samples per pixel of the reference.
+      native: also frames at the reference's size (the input of native TAA).
     """
 
     split: str
@@ -34,6 +35,7 @@ class Clip(NamedTuple):
     seed: int
     frames: int
     spp: int = 64
+    native: bool = False
 
     @property
     def name(self) -> str:
@@ -42,7 +44,14 @@ class Clip(NamedTuple):
 
 
 def plan(
-    split: str, sequences: int, frames: int, *, spp: int = 64, families: Iterable[str] | None = None, start: int = 0
+    split: str,
+    sequences: int,
+    frames: int,
+    *,
+    spp: int = 64,
+    native: bool = False,
+    families: Iterable[str] | None = None,
+    start: int = 0,
 ) -> list[Clip]:
     """Clips of a split: ``sequences`` of each of its families, interleaved; seeds of different splits are disjoint.
 
@@ -51,6 +60,7 @@ def plan(
       sequences: per family.
       frames: per sequence.
       spp: samples per pixel of the references.
+      native: also frames at the references' size.
       families: only these, in the test split also ``scenes.EXTRA_FAMILIES``; None: all families of the split.
       start: skip this many seeds of the split.
 
@@ -65,7 +75,7 @@ def plan(
             hint = f" ({family} is in the test split only)" if family in FAMILIES + EXTRA_FAMILIES else ""
             raise ValueError(f"families: {split} has {', '.join(allowed)}; got {family!r}{hint}.")
     clips = [
-        Clip(split, family, seed, frames, spp)
+        Clip(split, family, seed, frames, spp, native)
         for seed in split_seeds(split, sequences, start=start)
         for family in allowed
         if family in chosen
@@ -108,7 +118,6 @@ def generate(
     height: int,
     *,
     scale: int = 2,
-    native: bool = False,
     ranges: bool = False,
     mip_bias: float = 0.0,
     jitter: str = "halton",
@@ -125,7 +134,6 @@ def generate(
       width: LR width, pixels.
       height: LR height, pixels.
       scale: reference size over frame size.
-      native: also frames at the reference's size (the input of native TAA).
       ranges: also the ranges over the reference's samples (what a classifier's labels are made of).
       mip_bias: texture filter, see ``scenes.render_frame``.
       jitter: pattern, "halton" or "dlctus", see ``scenes.jitter_sequence``.
@@ -135,9 +143,9 @@ def generate(
       ValueError: the folder holds data made with other settings, or a setting is invalid.
     """
     out, clips = Path(out), list(clips)
-    shared = {"renderer": RENDERER, "width": width, "height": height, "scale": scale, "native": native}
+    shared = {"renderer": RENDERER, "width": width, "height": height, "scale": scale}
     shared["mip_bias"] = float(mip_bias)
-    settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+    settings = {"scale": scale, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
     shared |= {key: settings[key] for key, usual in UNSAID.items() if settings[key] != usual}
     splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
@@ -146,7 +154,7 @@ def generate(
         writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
         for index in range(clip.frames):
             if index not in writer:
-                frame = render_frame(scene, index, width, height, spp=clip.spp, **settings)
+                frame = render_frame(scene, index, width, height, spp=clip.spp, native=clip.native, **settings)
                 extra = {name: getattr(frame, name) for name in ("valid", "steady", "native", "ranges")}
                 writer.write(index, frame.frames, frame.reference, **extra)
             done += 1
@@ -163,7 +171,6 @@ def live_source(
     height: int,
     *,
     scale: int = 2,
-    native: bool = False,
     ranges: bool = False,
     mip_bias: float = 0.0,
     jitter: str = "halton",
@@ -176,7 +183,6 @@ def live_source(
       width: LR width, pixels.
       height: LR height, pixels.
       scale: see ``generate``.
-      native: see ``generate``.
       ranges: see ``generate``.
       mip_bias: see ``generate``.
       jitter: see ``generate``.
@@ -185,7 +191,7 @@ def live_source(
 
     def render(clip: Clip) -> essjax.frames.Sequence:
         scene = make_scene(clip.family, clip.seed, clip.frames)
-        settings = {"scale": scale, "native": native, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
-        return render_sequence(scene, width, height, spp=clip.spp, on_frame=on_frame, **settings)
+        settings = {"scale": scale, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+        return render_sequence(scene, width, height, spp=clip.spp, native=clip.native, on_frame=on_frame, **settings)
 
     return CachedSource(functools.partial(render, clip) for clip in clips)

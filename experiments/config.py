@@ -34,7 +34,7 @@ class Config:
     train_frames: int = 10
     test_frames: int = 12
     train_spp: int = 16
-    test_spp: int = 64
+    test_spp: int = 32
     mip_bias: float = 0.0
     jitter: str = "halton"
     clip: int = 7
@@ -77,7 +77,7 @@ PRESETS: dict[str, Config] = {
     "quick": Config(),
     "paper": Config(
         size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
-        train_spp=64, clip=9, crop=(128, 128), batch=12, first_batch=8, width=24, first_width=24,
+        train_spp=64, test_spp=64, clip=9, crop=(128, 128), batch=12, first_batch=8, width=24, first_width=24,
         first_learning_rate=1e-4, learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0,
         first_steps=100 * 900, steps=120 * 600, first_seconds=None, seconds=None, save_every=300.0, pictures=2,
     ),

@@ -25,8 +25,8 @@ def scene_clips(config: Config) -> list[Clip]:
     """The built-in scenes of a run: of all splits."""
     return [
         *train_clips(config),
-        *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp),
-        *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp),
+        *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp, native=True),
+        *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp, native=True),
     ]
 
 
@@ -61,7 +61,7 @@ def prepare(
         dataset = read_dataset(data)
     else:
         width, height = config.size
-        settings = {**render_settings(config), "native": True, "ranges": ranges}
+        settings = {**render_settings(config), "ranges": ranges}
         dataset = generate(out / "scenes", scene_clips(config), width, height, progress=progress, **settings)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):
@@ -74,7 +74,7 @@ def prepare(
             f"{dataset.path}: a classifier is trained on labels made of the ranges over all samples of each reference "
             "pixel, which this dataset does not have. Render the scenes with --ranges; imported frames have none."
         )
-    if native and not dataset.info.native:
+    if native and not dataset.has_native("validation", "test"):
         raise ValueError(
             f"{dataset.path}: all variants of this run work on frames at native resolution, which this dataset does "
             "not have. Render the scenes with --native; imported frames have none."

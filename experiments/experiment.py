@@ -137,7 +137,8 @@ def run_experiment(
 
         phases.show("tuning", text="reading")
         methods = [VARIANTS[row].method(config) for row in compared(names)]
-        options = {"native": any(method.info.native for method in methods), "ranges": bool(classifiers)}
+        native = any(method.info.native for method in methods) and dataset.has_native("validation", "test")
+        options = {"native": native, "ranges": bool(classifiers)}
         validation, clips = (Clips(dataset, split, config.warmup, **options) for split in ("validation", "test"))
         runners, settings = make_runners(
             names, config, trained, validation, out, lambda text: phases.show("tuning", text=text)

@@ -64,9 +64,9 @@ def test_plan_errors():
 
 
 def test_several_splits_in_one_dataset(tmp_path, instant_renderer):
-    wanted = plan("train", 1, 3, families=["gloss", "texture"]) + plan("test", 1, 4, families=["plaza"])
+    wanted = plan("train", 1, 3, families=["gloss", "texture"]) + plan("test", 1, 4, families=["plaza"], native=True)
     seen = []
-    dataset = generate(tmp_path, wanted, 8, 6, native=True, progress=lambda done, total: seen.append((done, total)))
+    dataset = generate(tmp_path, wanted, 8, 6, progress=lambda done, total: seen.append((done, total)))
     assert {split: [(s.first, s.last) for s in segments] for split, segments in dataset.splits.items()} == {
         "train": [(0, 2), (0, 2)],
         "test": [(0, 3)],
@@ -74,7 +74,9 @@ def test_several_splits_in_one_dataset(tmp_path, instant_renderer):
     assert seen == [(n + 1, 10) for n in range(10)]
     sequence = read_sequence(dataset, wanted[0].name)
     validate_sequence(sequence, "gloss")
-    assert sequence.native is not None and sequence.steady is not None and sequence.scale == 2
+    assert sequence.native is None and read_sequence(dataset, wanted[-1].name).native.motion.shape == (4, 12, 16, 2)
+    assert dataset.has_native("test") and not dataset.has_native("train")
+    assert sequence.steady is not None and sequence.scale == 2
 
 
 def test_generate_resumes_at_the_frame_it_was_stopped_at(tmp_path, instant_renderer):

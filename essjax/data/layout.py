@@ -39,8 +39,8 @@ KINDS = ("lr", "hr", "native", "ranges")
 """Kinds of files that a frame may consist of."""
 
 
-AGREE = ("width", "height", "scale", "channels", "native", "ranges")
-"""Fields of ``SequenceInfo`` in which all frames of a dataset agree."""
+AGREE = ("width", "height", "scale", "channels", "ranges")
+"""Fields of ``SequenceInfo`` in which all sequences of a dataset agree; frames of one agree in ``native`` as well."""
 
 
 class Segment(NamedTuple):
@@ -105,7 +105,7 @@ class Dataset:
     Attributes:
       path: the folder.
       source: where the data comes from, as the producer describes it.
-      sequences: name -> ``SequenceInfo``; all agree in size, scale, channels, native and ranges.
+      sequences: name -> ``SequenceInfo``; all agree in size, scale, channels and ranges.
       splits: "train", "validation", "test" -> segments.
     """
 
@@ -116,7 +116,7 @@ class Dataset:
 
     @property
     def info(self) -> SequenceInfo:
-        """The first sequence: size, scale, channels, native and ranges are those of all."""
+        """The first sequence: size, scale, channels and ranges are those of all."""
         return next(iter(self.sequences.values()))
 
     def segments(self, split: str) -> tuple[Segment, ...]:
@@ -124,6 +124,10 @@ class Dataset:
         if split not in self.splits:
             raise ValueError(f"{self.path}: no split {split!r}; this dataset has {', '.join(self.splits) or 'none'}.")
         return self.splits[split]
+
+    def has_native(self, *splits: str) -> bool:
+        """Whether every sequence of these splits has frames at the reference's size."""
+        return all(self.sequences[segment.sequence].native for split in splits for segment in self.segments(split))
 
     def numbers(self, segment: Segment) -> tuple[int, ...]:
         """Original numbers of the frames that ``read_segment`` returns, in order."""
@@ -303,7 +307,7 @@ def write_dataset(
             "size": [info.width, info.height],
             "scale": info.scale,
             "channels": list(info.channels),
-            "native": info.native,
+            "native": [name for name, info in sequences.items() if info.native],
             "ranges": info.ranges,
             "sequences": list(sequences),
             "splits": {split: [segment._asdict() for segment in segments] for split, segments in resolved.items()},

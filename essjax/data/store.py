@@ -161,7 +161,7 @@ class SequenceWriter:
 
     def _check_next(self, number: int, described: SequenceInfo, cut: bool) -> SequenceInfo:
         info = self.info or described
-        for field in AGREE:
+        for field in (*AGREE, "native"):
             if getattr(info, field) != getattr(described, field):
                 raise ValueError(
                     f"sequence {self.name}, frame {number}: {field} changes from {getattr(info, field)} to "

@@ -89,6 +89,15 @@ def test_pictures(tmp_path):
     assert path == tmp_path / "report" / "labels-test-gloss-1-frame-7.png" and Image.open(path).size[0] > 900
 
 
+def test_only_clips_that_something_reads_have_native_frames(tmp_path, monkeypatch):
+    """Tuning and the test read them; training never does (``tests/data/test_loader.py``)."""
+    asked = []
+    monkeypatch.setattr(datasets, "generate", lambda out, clips, *size, **settings: asked.extend(clips))
+    with pytest.raises(AttributeError):  # there is no dataset
+        datasets.prepare(PRESETS["quick"], None, tmp_path, lambda n, total: None)
+    assert {(clip.split, clip.native) for clip in asked} == {("train", False), ("validation", True), ("test", True)}
+
+
 def test_data_without_ranges_or_native_frames_is_refused_before_training(tmp_path):
     sequence = jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), make_sequence(0, T, 1, H, W))
     write_sequence(tmp_path, "a", sequence)
