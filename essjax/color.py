@@ -70,6 +70,11 @@ def reinhard(color: Image) -> Image:
     return color / (1.0 + color)
 
 
+def log1p_of_reinhard(encoded: Image, *, limit: float = 0.9999) -> Image:
+    """log(1 + x) of ``encoded`` = x / (1 + x), which is -log(1 - encoded); clamped to [0, ``limit``] first."""
+    return -jnp.log1p(-jnp.clip(encoded, 0.0, limit))
+
+
 def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:
     """Inverse of ``reinhard``; values above ``limit`` are clamped so that the result stays finite.
 

@@ -6,7 +6,8 @@ from essjax.methods.composed import composed, settled, with_taa
 from essjax.methods.dlctus import dlctus
 from essjax.methods.extranet import extranet
 from essjax.methods.extranet import from_torch as extranet_from_torch
-from essjax.methods.extrass import extrass, extrass_e, extrass_w
+from essjax.methods.extrass import extrass
+from essjax.methods.extrass_low import extrass_e, extrass_w
 from essjax.methods.fasset import fasset
 from essjax.methods.fasset_baselines import extranet_nsrr, extranet_plus, nsrr_extranet
 from essjax.methods.ifrnet import ifrnet

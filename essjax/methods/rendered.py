@@ -8,7 +8,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from essjax.color import demodulate, demodulation_albedo, modulate
+from essjax.color import demodulate, demodulation_albedo, modulate, reinhard, reinhard_inverse
 from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
 from essjax.interfaces import expand_flag, reset_at_cut
 from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
@@ -170,7 +170,8 @@ def guided_extrapolation(
 ) -> Color:
     """f_g: rendered frames warped to ``frame``'s samples, ``[2, ..., H, W, 3]`` (or without that axis; eq 1-3).
 
-    Shading is warped and modulated with the *current* base colour (section 4.2). Black where nothing was rendered yet.
+    Shading is warped and modulated with the *current* base colour (section 4.2); the warp blends x / (1 + x), so that
+    of four candidates a bright one does not rule. Black where nothing was rendered yet.
 
     Args:
       rendered: one frame or more of a ``Memory``.
@@ -185,12 +186,12 @@ def guided_extrapolation(
         return jnp.broadcast_to(leaf, like + leaf.shape)
 
     shading = gbuffer_guided_warp(
-        rendered.content.shading,
+        reinhard(rendered.content.shading),
         rendered.content.guide,
         share(guides(frame.gbuffers)),
         jittered_motion(rendered.motion, share(frame.jitter), rendered.jitter),
         sigma_guide=sigma_guide,
         sigma_distance=sigma_distance,
     )
-    shading = jnp.where(expand_flag(count > 0, frame.motion.ndim), shading, 0.0)
+    shading = jnp.where(expand_flag(count > 0, frame.motion.ndim), reinhard_inverse(shading), 0.0)
     return modulate(shading, albedo(frame.gbuffers))

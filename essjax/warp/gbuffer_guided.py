@@ -24,8 +24,8 @@ STRIDES = (1, 3, 5, 9)
 WINNERS = 4
 _SORT_FOUR = ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))
 _SORT_BITONIC = ((0, 2), (1, 3), (0, 1), (2, 3))
-SIGMA_GUIDE = (0.1, 0.1, 0.1, 0.2, 0.2, 0.2)
-"""Base colour, normal: a starting value measured on a path-traced clip; the paper gives none."""
+SIGMA_GUIDE = (0.15, 0.15, 0.15, 0.14, 0.14, 0.14)
+"""Base colour, normal: chosen on validation frames (experiments/LOG.md); the paper gives none."""
 SIGMA_DISTANCE = 2.0
 _ID_MASK = 63  # 6 bits hold a candidate's number
 LIMIT = 1e15  # scaled guides beyond this match nothing

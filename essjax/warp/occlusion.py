@@ -15,7 +15,7 @@ _MIN_N_DOT_V = 0.1
 _TYPICAL_N_DOT_V = 0.25  # where the channel is absent: towards grazing, so that floors are not holes
 _OFF_SCREEN = 1e9  # pixels: a splat drops what goes there
 _COMPARED = {"depth": 1, "normal": 3, "world_position": 3, "stencil": 1, "n_dot_v": 1}  # buffer: channels
-_MIN_TAP_WEIGHT = 1e-3  # a tap that bilinear interpolation would ignore proves nothing
+_MIN_TAP_WEIGHT = 0.1  # a tap that bilinear interpolation hardly reads proves little
 
 
 def occlusion_motion(motion: Motion, depth: Plane, hole: Mask) -> Motion:
@@ -85,14 +85,16 @@ def hole_mask(
     position_threshold: float = 2.0,
     depth_threshold: float = 0.1,
     stencil_threshold: float = 0.5,
+    front_threshold: float = 0.02,
 ) -> Mask:
     """Where the previous frame showed the same surface: three conditions on G-buffers (ExtraNet eq 8-10; SPEC 2).
 
-    A pixel is a hole where the stencil differs; where it is dynamic (stencil > 0) and normals disagree; where it is
+    Surfaces differ where the stencil does; where they are dynamic (stencil > 0) and normals disagree; where they are
     static and the world position moved by more than ``position_threshold`` footprints of a pixel,
     ``depth / (H * NoV)``, which is scale-free (a vertical field of view near 53 degrees makes it exact); between sky
-    and surface; off screen. Sky to sky is valid. The previous frame is compared at the up to four pixels that bilinear
-    interpolation would read and the best match counts, so that thin things and silhouettes are not all holes.
+    and surface. A pixel is a hole where of the up to four pixels that bilinear interpolation mainly reads none shows
+    its surface and all show something in front: what lies behind it, or beside it, has not hidden it. Where a rope
+    is seen now and the sky was before, the rope was there, and the samples missed it. Off screen is a hole.
 
     Absent channels: without ``n_dot_v`` it counts as 0.25; without ``stencil`` everything counts as static; without
     ``world_position`` static pixels are compared by normal and by depth (relatively) instead - that of
@@ -108,7 +110,8 @@ def hole_mask(
       normal_threshold: smallest cosine between normals of the same dynamic surface.
       position_threshold: largest move of a static surface, in pixel footprints.
       depth_threshold: largest relative difference in depth, where there is no world position.
-      stencil_threshold: largest difference in id; the released code uses 1, here any difference is a hole.
+      stencil_threshold: largest difference in id; the released code uses 1, here any difference counts.
+      front_threshold: relative difference in depth from which on a surface lies in front of another.
 
     Returns:
       float32 ``[..., H, W, 1]``: 1 valid, 0 hole.
@@ -136,6 +139,7 @@ def hole_mask(
             same = _same_surface(
                 current, there, normal_threshold, position_threshold, depth_threshold, stencil_threshold
             )
+            same |= ~(there.depth < (1.0 - front_threshold) * current.depth)
             valid |= same & (row.weight * column.weight > _MIN_TAP_WEIGHT)[..., None]
     # Computed once: fused into all that read it, the 4 taps would be fetched again for every read.
     return jax.lax.optimization_barrier(valid.astype(jnp.float32) * inside_mask(lookup))

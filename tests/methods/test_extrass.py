@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from essjax.color import demodulate, display, log1p, modulate
+from essjax.color import demodulate, display, log1p, modulate, reinhard, reinhard_inverse
 from essjax.frames import GBuffers, select_time, without_color
 from essjax.methods import extrass, extrass_e, extrass_w
-from essjax.methods.extrass import blend_mask, refine
+from essjax.methods.extrass import warp_history
+from essjax.methods.extrass_low import blend_mask, refine
 from essjax.methods.rendered import albedo
 from essjax.networks import frnet
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
@@ -76,9 +77,10 @@ def test_one_frame_by_hand():
     _, image = streaming(SHARP)[ESS]({}, history, second)
     assert float(jnp.abs(first.jitter - second.jitter).max()) > 0.05
     warp = jax.jit(functools.partial(gbuffer_guided_warp, sigma_guide=0.002))
-    shading = demodulate(first.color, albedo(first.gbuffers)), guides(first.gbuffers), guides(second.gbuffers)
+    encoded = reinhard(demodulate(first.color, albedo(first.gbuffers)))
+    shading = encoded, guides(first.gbuffers), guides(second.gbuffers)
     by_hand = [
-        modulate(warp(*shading, second.motion + sign * (second.jitter - first.jitter)[:, None, None, :]),
+        modulate(reinhard_inverse(warp(*shading, second.motion + sign * (second.jitter - first.jitter)[:, None, None])),
                  albedo(second.gbuffers)) for sign in (1, -1)
     ]  # fmt: skip
     np.testing.assert_allclose(image, by_hand[0], rtol=1e-4, atol=1e-5)
@@ -262,3 +264,31 @@ def test_untrained_network_is_a_sensible_baseline(untrained):
     assert np.all(late_ss > nearest[8::2].mean(axis=0) + 1.0)
     assert np.all(np.abs(late_ess - late_ss) < 1.5)
     assert np.all(late_ss > quality[0] + 1.0)  # it accumulates
+
+
+def test_history_beside_a_lamp_does_not_ring():
+    """A bicubic read of linear radiance would draw a black ring around one bright pixel."""
+    frame = select_time(random_frames(), 1)
+    height, width = frame.motion.shape[-3:-1]
+    frame = dataclasses.replace(frame, motion=jnp.full_like(frame.motion, 0.25), cut=jnp.zeros_like(frame.cut))
+    image = jnp.ones((frame.motion.shape[0], 2 * height, 2 * width, 3)).at[:, 9, 11].set(1000.0)
+    history = dataclasses.replace(extrass(width=8).start(frame), image=image)
+    warped = jax.jit(functools.partial(warp_history, scale=2))(history, frame).log_image
+    assert float(jnp.expm1(warped).min()) > 0.7
+    assert float(jnp.expm1(warped[:, 9, 11]).max()) < 1000
+
+
+def test_trust_is_soft_beside_a_hole():
+    """One LR pixel that another surface covered before: its neighbours trust history a little less each."""
+    frame = select_time(random_frames(), 1)
+    still = dataclasses.replace(frame, motion=jnp.zeros_like(frame.motion), cut=jnp.zeros_like(frame.cut))
+    still = dataclasses.replace(still, reactive=None, gbuffers=dataclasses.replace(
+        still.gbuffers, depth=jnp.full_like(still.gbuffers.depth, 10.0)))  # fmt: skip
+    before = dataclasses.replace(still, gbuffers=dataclasses.replace(
+        still.gbuffers, depth=still.gbuffers.depth.at[:, 5, 6].set(2.0)))  # fmt: skip
+    method = extrass(width=8)
+    history = dataclasses.replace(method.start(before), empty=jnp.zeros_like(frame.cut))
+    valid = warp_history(history, still, 2).valid_low[0, ..., 0]
+    expected = np.ones(valid.shape)
+    expected[4:7, 5:8] = 8 / 9
+    np.testing.assert_allclose(valid, expected, rtol=1e-5)

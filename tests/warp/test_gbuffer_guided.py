@@ -16,7 +16,7 @@ FEW = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**31 - 1)
 warp = jax.jit(gbuffer_guided_warp)
 weights_of = jax.jit(guided_weights)
-SIGMAS = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
+SIGMAS = np.array([0.15, 0.15, 0.15, 0.14, 0.14, 0.14])
 
 
 def scene(seed, motion_size=4.0, height=H, width=W):

@@ -53,8 +53,8 @@ def test_any_one_of_the_conditions_finds_it():
     """By ids alone, by positions alone, and by depth where a renderer gives neither."""
     current, previous, motion, expected = moved_object()
     drop = lambda g, *names: dataclasses.replace(g, **dict.fromkeys(names))
-    same_depth = np.full((H, W, 1), 10, np.float32)
-    ids = [dataclasses.replace(drop(g, "world_position"), depth=same_depth) for g in (current, previous)]
+    closer = lambda g: np.where(g.stencil > 0, np.float32(9.5), np.float32(10))  # by less than the depth threshold
+    ids = [dataclasses.replace(drop(g, "world_position"), depth=closer(g)) for g in (current, previous)]
     np.testing.assert_array_equal(mask(*ids, motion)[..., 0], expected)
     depths = [drop(g, "world_position", "stencil", "n_dot_v") for g in (current, previous)]
     np.testing.assert_array_equal(mask(*depths, motion)[..., 0], expected)
@@ -62,6 +62,37 @@ def test_any_one_of_the_conditions_finds_it():
     uncovered = mask(*positions, motion, position_threshold=0.5)[..., 0]
     static = np.asarray(current.stencil[..., 0]) == 0  # without ids a moving object's position counts as moved
     np.testing.assert_array_equal(np.asarray(uncovered)[static], expected[static])
+
+
+def in_front(gbuffers):
+    """The same surfaces, a little closer: as much as hides what lies behind, less than the depth threshold."""
+    return dataclasses.replace(gbuffers, depth=gbuffers.depth * np.float32(0.95))
+
+
+def test_only_what_lies_in_front_hides():
+    """Another id, normal and position, but beside or behind: whatever is seen now was not hidden."""
+    current, previous, motion, expected = moved_object()
+    behind = wall(4, 7, near=30.0)  # what stood there before was a window to something farther away
+    assert (np.asarray(mask(current, behind, motion))[2:7, 4:7] == 1).all()
+    for factor, found in ((0.97, 0), (0.99, 1)):
+        beside = wall(4, 7, near=10.0 * factor)
+        np.testing.assert_array_equal(np.asarray(mask(current, beside, motion))[2:7, 4:7], found)
+
+
+def test_rope_before_the_sky_is_no_hole():
+    """A rope thinner than a pixel, hit by some rows in one frame and by others in the next: nothing has moved."""
+    y, x = np.mgrid[:H, :W]
+
+    def rope(rows):
+        here = (x == 6) & np.isin(y, rows)
+        depth = np.where(here, 5.0, np.inf).astype(np.float32)[..., None]
+        normal = np.where(here[..., None], np.float32([0, 0, -1]), 0).astype(np.float32)
+        return GBuffers(depth=depth, normal=normal, stencil=np.zeros((H, W, 1), np.int32))
+
+    still = np.zeros((H, W, 2), np.float32)
+    jitters = {"jitter": jnp.array([0.3, 0.2]), "jitter_previous": jnp.array([-0.2, -0.1])}
+    got = np.asarray(mask(rope([1, 2, 5]), rope([0, 3, 4, 5]), still, **jitters))
+    assert (got[1:-1, 1:-1] == 1).all()
 
 
 def test_ids_within_the_threshold_are_the_same():
@@ -73,7 +104,7 @@ def test_ids_within_the_threshold_are_the_same():
 def test_dynamic_pixels_compare_normals_and_static_ones_do_not():
     current = wall(4, 7)
     tilt = np.float32([0, np.sin(0.3), np.cos(0.3)])  # cosine 0.955
-    previous = dataclasses.replace(current, normal=np.broadcast_to(tilt, (H, W, 3)))
+    previous = in_front(dataclasses.replace(current, normal=np.broadcast_to(tilt, (H, W, 3))))
     still = np.zeros((H, W, 2), np.float32)
     expected = np.where(np.asarray(current.stencil) > 0, 0, 1)
     np.testing.assert_array_equal(mask(current, previous, still), expected)
@@ -82,8 +113,8 @@ def test_dynamic_pixels_compare_normals_and_static_ones_do_not():
 
 def test_static_threshold_is_in_pixel_footprints_and_wider_at_grazing_angles():
     current = wall(99, 99)  # the wall alone: footprint = depth / H
-    shift = lambda pixels: dataclasses.replace(
-        current, world_position=current.world_position + np.float32([pixels * 10 / H, 0, 0])
+    shift = lambda pixels: in_front(
+        dataclasses.replace(current, world_position=current.world_position + np.float32([pixels * 10 / H, 0, 0]))
     )
     still = np.zeros((H, W, 2), np.float32)
     assert (np.asarray(mask(current, shift(1.9), still)) == 1).all()
@@ -104,14 +135,16 @@ def test_scale_free(scale):
     np.testing.assert_array_equal(mask(resize(current), resize(previous), motion)[..., 0], expected)
 
 
-def test_sky_to_sky_is_valid_and_sky_to_surface_a_hole():
+def test_sky_to_sky_is_valid_and_sky_behind_a_surface_a_hole():
     sky = lambda columns: dataclasses.replace(
         wall(99, 99),
         depth=np.where(np.arange(W)[None, :, None] < columns, np.inf, 10.0).astype(np.float32)
         * np.ones((H, 1, 1), "f"),
         normal=np.where(np.arange(W)[None, :, None] < columns, 0.0, 1.0).astype(np.float32) * np.ones((H, 1, 3), "f"),
     )
-    got = mask(sky(5), sky(8), np.zeros((H, W, 2), np.float32))
+    still = np.zeros((H, W, 2), np.float32)
+    assert (np.asarray(mask(sky(5), sky(8), still)) == 1).all()  # a surface before the sky was never hidden by it
+    got = mask(sky(8), sky(5), still)
     expected = np.ones((H, W))
     expected[:, 5:8] = 0
     np.testing.assert_array_equal(got[..., 0], expected)
@@ -128,9 +161,9 @@ def test_off_screen_is_a_hole():
 
 def test_jitter_difference_keeps_silhouettes_valid():
     """One static edge, sampled with opposite jitters: the best of the four taps finds the same surface."""
-    current, previous = wall(4, 8, stencil=0), wall(4, 7, stencil=0)
+    current, previous = wall(4, 7, stencil=0), wall(4, 8, stencil=0)
     flat = [dataclasses.replace(g, world_position=None, stencil=None) for g in (current, previous)]
-    jitters = {"jitter": jnp.array([-0.4, 0.0]), "jitter_previous": jnp.array([0.4, 0.0])}
+    jitters = {"jitter": jnp.array([0.4, 0.0]), "jitter_previous": jnp.array([-0.4, 0.0])}
     still = np.zeros((H, W, 2), np.float32)
     assert np.asarray(mask(*flat, still))[4, 8, 0] == 0
     assert (np.asarray(mask(*flat, still, **jitters))[1:-1, 1:-1] == 1).all()

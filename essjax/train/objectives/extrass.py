@@ -23,7 +23,7 @@ from essjax.losses import (
     sum_of_means,
     temporal_l1,
 )
-from essjax.methods.extrass import halve
+from essjax.methods.extrass_low import halve
 from essjax.networks.blocks import nearest_upsample
 from essjax.rollout import ESS, SS
 from essjax.train.objectives.common import (
