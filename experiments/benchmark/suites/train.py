@@ -20,6 +20,7 @@ from experiments.benchmark.suites import Options, Row
 from experiments.config import Config, make_config
 from experiments.training import initial_variables, make_batches
 from experiments.variants import stages_of
+from experiments.variants.base import Stage
 
 FRAMES = (5, 9, 13)
 """Lengths of clips; odd, as SS/ESS pairs need."""
@@ -29,12 +30,13 @@ BATCH = 2
 WIDTH = 24
 """Of the networks: the paper preset's."""
 LOADED_STEPS = 40
+DEFAULT = "a step of the default run:"
 
 
-def _clip(length: int, side: int) -> Sequence:
+def _clip(length: int, width: int, height: int, batch: int = BATCH) -> Sequence:
     """A batch of clips ``[T, B, H, W, C]`` of synthetic frames."""
-    frames = [inputs.frame(side, side, 100 * n) for n in range(length)]
-    stacked: Frame = jax.tree.map(lambda *leaves: np.stack(leaves).repeat(BATCH, axis=1), *frames)
+    frames = [inputs.frame(width, height, 100 * n) for n in range(length)]
+    stacked: Frame = jax.tree.map(lambda *leaves: np.stack(leaves).repeat(batch, axis=1), *frames)
     reference = np.asarray(stacked.color).repeat(2, axis=-3).repeat(2, axis=-2)
     return Sequence(frames=stacked, reference=reference)
 
@@ -43,22 +45,31 @@ def _step_case(length: int, side: int) -> Case:
     """The whole train step: both rollouts, all losses, gradient, Adam."""
     config = make_config("quick", [f"width={WIDTH}", f"first_width={WIDTH}"])
     stage = stages_of("extrass", config)[-1]
-    clip = _clip(length, side)
+    return _case(f"train step, {length} frames of {side}x{side}, batch {BATCH}", stage, _clip(length, side, side))
+
+
+def _default_case(stage: Stage, config: Config) -> Case:
+    """The same of a stage of the default run, at its shapes."""
+    return _case(f"{DEFAULT} {stage.name}", stage, _clip(config.clip, *config.crop, stage.batch))
+
+
+def _case(name: str, stage: Stage, clip: Sequence) -> Case:
+    length, batch, height, width = clip.frames.motion.shape[:4]
     variables = stage.method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
     transform = optimizer()
     step = make_train_step(stage.objective, transform, stage.name)
     # The state is donated inside; here it is an ordinary argument, so that a repetition starts where the last did.
     return Case(
-        f"train step, {length} frames of {side}x{side}, batch {BATCH}",
+        name,
         lambda state, clip: step.__wrapped__(state, clip, 1e-4),
         (create_state(variables, stage.name, transform), clip),
-        work={"frames": length * BATCH, "pixels": length * BATCH * side * side},
+        work={"frames": length * batch, "pixels": length * batch * height * width},
     )
 
 
 def _unrolled_case(method: Method, *, remat: bool, gradient: bool) -> Case:
     """``unroll`` alone over 8 frames; with its gradient, or forward only."""
-    clip = _clip(8, 64)
+    clip = _clip(8, 64, 64)
     variables = method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
 
     def loss(variables, frames):
@@ -70,8 +81,10 @@ def _unrolled_case(method: Method, *, remat: bool, gradient: bool) -> Case:
 
 
 def rows(options: Options) -> Iterator[Row]:
-    """Steps of three lengths and three sizes, unrolled gradients, and training that reads its clips."""
-    repetitions = options.repetitions
+    """Steps of the default run, of three lengths and three sizes, unrolled gradients, training that reads its clips."""
+    repetitions, default = options.repetitions, make_config("quick", [])
+    for stage in stages_of("extrass", default):
+        yield measure(_default_case(stage, default), repetitions)
     for length, side in sorted({(length, CROPS[1]) for length in FRAMES} | {(FRAMES[1], side) for side in CROPS}):
         yield measure(_step_case(length, side), repetitions)
     method = stages_of("extrass", make_config("quick", [f"width={WIDTH}", f"first_width={WIDTH}"]))[-1].method
@@ -115,7 +128,8 @@ def _fit(sizes: list[float], milliseconds: list[float]) -> tuple[float, float]:
 
 
 def facts(rows: list[Row]) -> dict[str, float]:
-    """Linear fits in frames and pixels, rates of products, what remat costs, how long the step waits for data."""
+    """Speed of the default run, fits in frames and pixels, rates of products, cost of remat, waiting for data."""
+    default = {row["name"].removeprefix(DEFAULT): row for row in rows if row["name"].startswith(DEFAULT)}
     steps = {row["name"]: row for row in rows if row["name"].startswith("train step")}
     name = "train step, {} frames of {}x{}, batch " + str(BATCH)
     by_frames = [steps[name.format(length, CROPS[1], CROPS[1])]["median_ms"] for length in FRAMES]
@@ -125,6 +139,8 @@ def facts(rows: list[Row]) -> dict[str, float]:
     rates = {row["name"]: row["flops"] / row["median_ms"] / 1e6 for row in rows if "flops" in row}
     forward, gradient, remat = [row for row in rows if "unrolled frames" in row["name"]]
     return {
+        **{f"steps per second of the default run:{stage}": 1e3 / row["median_ms"] for stage, row in default.items()},
+        **{f"seconds to compile that step:{stage}": row["compile_seconds"] for stage, row in default.items()},
         "fit in frames: R²": frames_r2,
         "fit in frames: constant part of the longest": frames_intercept,
         "fit in pixels: R²": pixels_r2,
