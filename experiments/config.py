@@ -13,7 +13,7 @@ class Config:
 
     Data that the renderer makes (ignored with ``--data``, but for ``clip`` and ``crop``):
       seed, size (width, height), scale, train_sequences / validation_sequences / test_sequences (per family),
-      train_frames (also of validation), test_frames, train_spp (also of validation), test_spp, mip_bias (thesis
+      train_frames, test_frames (also of validation), train_spp (also of validation), test_spp, mip_bias (thesis
       002: 0 for its dataset 1, -1 for its dataset 2), jitter ("halton", or "dlctus" where every frame is rendered).
     Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
       learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (false:
@@ -28,10 +28,10 @@ class Config:
     seed: int = 0
     size: tuple[int, int] = (96, 54)
     scale: int = 2
-    train_sequences: int = 3
+    train_sequences: int = 1
     validation_sequences: int = 1
     test_sequences: int = 1
-    train_frames: int = 10
+    train_frames: int = 32
     test_frames: int = 12
     train_spp: int = 16
     test_spp: int = 32

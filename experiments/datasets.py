@@ -25,7 +25,7 @@ def scene_clips(config: Config) -> list[Clip]:
     """The built-in scenes of a run: of all splits."""
     return [
         *train_clips(config),
-        *plan("validation", config.validation_sequences, config.train_frames, spp=config.train_spp, native=True),
+        *plan("validation", config.validation_sequences, config.test_frames, spp=config.train_spp, native=True),
         *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp, native=True),
     ]
 

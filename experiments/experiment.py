@@ -222,7 +222,7 @@ def _train_all(
             continue
         stages, folder = stages_of(name, config), folders[name]
         if eval_only:
-            variables, report = restore_stages(stages, folder, initial[base])
+            variables, report = restore_stages(stages, dataset, config, folder, initial[base])
         else:
             if not config.vgg and any(stage.vgg for stage in stages):
                 phases.console.print(

@@ -10,12 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from essjax.data import CachedSource, Rounds, clips, disk_source
+from essjax.data import CachedSource, Rounds, clips, disk_source, successive_clips
 from essjax.data.layout import Dataset
-from essjax.frames import select_time
+from essjax.frames import Sequence, select_time
 from essjax.generate import RENDERER, live_source
 from essjax.train import (
     Checkpoints,
+    Recurrent,
+    TrainState,
     create_state,
     learning_rate,
     make_train_step,
@@ -61,14 +63,26 @@ def check_batches(dataset: Dataset, config: Config, stage: Stage) -> None:
             f"--set fresh={config.fresh}: {dataset.path} was not made by the built-in renderer, so there are no new "
             "scenes of it. Leave fresh away, or train on the built-in scenes (no --data)."
         )
-    clips(disk_source(dataset, "train", ranges=stage.ranges, memory=0), **_cut(dataset, config, stage))
+    source = disk_source(dataset, "train", ranges=stage.ranges, memory=0)
+    cutter(stage)(source, **_cut(dataset, config, stage))
+
+
+def cutter(stage: Stage) -> Callable:
+    """What cuts a stage's clips: those of a recurrent objective follow each other."""
+    return successive_clips if isinstance(stage.objective, Recurrent) else clips
+
+
+def clip_length(stage: Stage, config: Config, longest: int) -> int:
+    """Frames per clip, of sequences with ``longest`` frames at most; odd where clips follow each other."""
+    length = min(config.clip, longest)
+    return length - 1 + length % 2 if isinstance(stage.objective, Recurrent) else length
 
 
 def _cut(dataset: Dataset, config: Config, stage: Stage) -> dict[str, Any]:
-    """How clips are cut, for ``data.clips``."""
+    """How clips are cut, for ``cutter``."""
     width, height = check_crop(config, dataset.info.width, dataset.info.height)
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
-    return {"length": min(config.clip, longest), "batch": stage.batch, "crop": (height, width)}
+    return {"length": clip_length(stage, config, longest), "batch": stage.batch, "crop": (height, width)}
 
 
 def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: int = 4):
@@ -85,7 +99,7 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: in
 
     def make(number: int):
         source = disk_source(dataset, "train", ranges=stage.ranges) if number == 0 else fresh(number)
-        return iter(clips(source, **cut, seed=config.seed + number))
+        return iter(cutter(stage)(source, **cut, seed=config.seed + number))
 
     def fresh(number: int) -> CachedSource:
         settings = {**render_settings(config), "ranges": stage.ranges}
@@ -96,10 +110,24 @@ def make_batches(dataset: Dataset, config: Config, stage: Stage, *, prefetch: in
 
 def initial_variables(stages: list[Stage], dataset: Dataset, config: Config) -> PyTree:
     """Fresh variables of the last stage's method, which holds those of the stages before it."""
-    # Without fresh scenes: the next round would be rendered for nothing.
-    batch = next(make_batches(dataset, dataclasses.replace(config, fresh=None), stages[-1], prefetch=1))
-    example = jax.tree.map(np.asarray, select_time(batch.frames, 0))
+    example = jax.tree.map(np.asarray, select_time(first_batch(dataset, config, stages[-1]).frames, 0))
     return stages[-1].method.init(jax.random.key(config.seed), example)
+
+
+def first_batch(dataset: Dataset, config: Config, stage: Stage) -> Sequence:
+    """The first one that ``make_batches`` gives."""
+    # Without fresh scenes: the next round would be rendered for nothing.
+    return next(make_batches(dataset, dataclasses.replace(config, fresh=None), stage, prefetch=1))
+
+
+def initial_state(stages: list[Stage], stage: Stage, variables: PyTree, batch: Sequence) -> TrainState:
+    """What ``stage`` starts with: variables of its own and of the stages before it; a history where clips follow.
+
+    Later stages' variables are not touched (nor saved) by it.
+    """
+    needed = {name: variables[name] for name in _entries(stages, stage)}
+    history = stage.objective.start(batch) if isinstance(stage.objective, Recurrent) else None
+    return create_state(needed, stage.name, optimizer(), history=history)
 
 
 def train_stages(
@@ -119,9 +147,7 @@ def train_stages(
     report = {}
     for stage in stages:
         transform = optimizer()
-        # A stage sees only its own method's variables: a later stage's are not touched (nor saved) by an earlier one.
-        needed = {name: variables[name] for name in _entries(stages, stage)}
-        state = create_state(needed, stage.name, transform)
+        state = initial_state(stages, stage, variables, first_batch(dataset, config, stage))
         checkpoints = Checkpoints(out / "checkpoints" / stage.name)
         try:
             state, report[stage.name] = train(
@@ -142,11 +168,15 @@ def train_stages(
     return variables, report
 
 
-def restore_stages(stages: list[Stage], out: Path, variables: PyTree) -> tuple[PyTree, dict[str, Any]]:
+def restore_stages(
+    stages: list[Stage], dataset: Dataset, config: Config, out: Path, variables: PyTree
+) -> tuple[PyTree, dict[str, Any]]:
     """The variables of the stages' newest checkpoints, for ``--eval-only``, and how they were trained.
 
     Args:
       stages: of a variant.
+      dataset: that it was trained on.
+      config: its settings.
       out: where it was trained.
       variables: the initial ones.
 
@@ -163,10 +193,11 @@ def restore_stages(stages: list[Stage], out: Path, variables: PyTree) -> tuple[P
             raise ValueError(
                 f"--eval-only: {folder} holds no checkpoint. Train first, or give the --out of a trained run."
             )
-        needed = {name: variables[name] for name in _entries(stages, stage)}
         checkpoints = Checkpoints(folder)
         try:
-            state, saved = checkpoints.restore(create_state(needed, stage.name, optimizer()))
+            state, saved = checkpoints.restore(
+                initial_state(stages, stage, variables, first_batch(dataset, config, stage))
+            )
         finally:
             checkpoints.close()
         variables = {**variables, **state.variables}

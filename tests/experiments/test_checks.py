@@ -27,7 +27,7 @@ def test_every_preset_has_frames_to_score(preset):
     ("overrides", "message"),
     [
         (["warmup=5"], "the built-in scenes, split test: expected frames to score in .*, got none in test-cuts-"),
-        (["tune=true", "warmup=6", "test_frames=40", "train_frames=6"], "validation: .* got none in validation-corrid"),
+        (["tune=true", "warmup=8"], "validation: .* got none in validation-corrid"),
         (["crop=[32,20]"], r"crop: expected at least 24x24 LR .* got 32x20 from crop \(32, 20\) of 48x28 frames"),
         (["size=[40,20]"], "got 32x20 from crop"),
     ],

@@ -18,7 +18,7 @@ from experiments.benchmark import inputs
 from experiments.benchmark.measure import Case, measure, summary
 from experiments.benchmark.suites import Options, Row
 from experiments.config import Config, make_config
-from experiments.training import initial_variables, make_batches
+from experiments.training import first_batch, initial_state, initial_variables, make_batches
 from experiments.variants import stages_of
 from experiments.variants.base import Stage
 
@@ -103,7 +103,8 @@ def _loaded(*settings: str) -> Row:
         dataset = generate(Path(folder), clips, *config.size, scale=config.scale)
         transform = optimizer()
         step = make_train_step(stage.objective, transform, stage.name)
-        state = create_state(initial_variables([stage], dataset, config), stage.name, transform)
+        variables = initial_variables([stage], dataset, config)
+        state = initial_state([stage], stage, variables, first_batch(dataset, config, stage))
         batches, waited, seconds = make_batches(dataset, config, stage), [], []
         for n in range(LOADED_STEPS + 2):
             start = time.perf_counter()
