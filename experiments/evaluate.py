@@ -69,7 +69,7 @@ def load_clip(dataset: Dataset, segment: Segment, warmup: int, *, native: bool =
     """Read a test segment; the first ``warmup`` frames and as many after each cut are not scored."""
     sequence = read_segment(dataset, segment, native=native, ranges=ranges)
     scored = scored_frames(np.asarray(sequence.frames.cut), dataset.scored(segment), warmup)
-    holes = 1.0 - np.asarray(_estimated_valid(sequence.frames) if sequence.valid is None else sequence.valid)
+    holes = 1.0 - np.asarray(estimated_valid(sequence.frames) if sequence.valid is None else sequence.valid)
     return Clip(segment.sequence, sequence, dataset.numbers(segment), scored, holes, sequence.valid is not None)
 
 
@@ -118,7 +118,8 @@ class Clips(collections.abc.Sequence[Clip]):
 
 
 @jax.jit
-def _estimated_valid(frames: Frame) -> Array:
+def estimated_valid(frames: Frame) -> Array:
+    """``hole_mask`` of each frame against the one before, ``[T, H, W, 1]``; of the first against itself."""
     previous = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), frames)
     return hole_mask(
         frames.gbuffers, previous.gbuffers, frames.motion, jitter=frames.jitter, jitter_previous=previous.jitter

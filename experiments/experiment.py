@@ -25,6 +25,7 @@ from experiments.classes import QUESTIONS, class_remark, evaluate_classes
 from experiments.comparison import Trained, make_runners, notes, owner_of, table_references
 from experiments.config import Config
 from experiments.evaluate import Clip, Clips, Runner, evaluate
+from experiments.holes import mask_remark, mask_scores
 from experiments.progress import Phases
 from experiments.report import print_table, write_report
 from experiments.report.classes import write_class_sheet
@@ -154,6 +155,7 @@ def run_experiment(
             on_step=lambda text: phases.show("evaluation", next(done) / (len(runners) * len(clips)), text),
         )
         classes = _evaluate_classes({name: runners[name] for name in classifiers}, configs, clips, out)
+        hole_scores = mask_scores(clips)
         dead = health.still_stages(reports) + _dead_methods(names, runners, trained, result["rows"], clips[0])
         phases.show("evaluation", 1.0)
         lap("evaluation")
@@ -175,11 +177,14 @@ def run_experiment(
     }
     if classes:
         metrics["classes"] = classes
+    if hole_scores:
+        metrics["hole_mask"] = hole_scores
     references = table_references(runners, dataset.info.scale)
     remarks = [f"Dead network: {text}" for text in dead] + [f"Warning: {text}" for text in metrics["warnings"]]
     remarks += health.training_note(reports)
     urgent = len(dead) + len(metrics["warnings"])
     remarks += notes(names, dataset, [clips.outline(n) for n in range(len(clips))], settings, config)
+    remarks += [mask_remark(hole_scores)] if hole_scores else []
     remarks += [class_remark(name, scores) for name, scores in classes.items()]
     page = write_report(
         out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references

@@ -3,8 +3,10 @@
 What is cheap is really run, at a small size; the run command end to end: ``tests/experiments/test_run.py``.
 """
 
+import ast
 import functools
 import importlib.util
+import inspect
 import re
 import runpy
 import shlex
@@ -189,6 +191,31 @@ def test_recipes_of_the_guide_are_read(tmp_path):
         path = tmp_path / "recipe.toml"
         path.write_text(block)
         load_recipe("generic" if block in whole else "unreal", path)
+
+
+def test_calls_of_the_readme_fit_their_functions():
+    """What its Python calls exists and takes these arguments; nothing is run: it would compile for half a minute."""
+    (block,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
+    tree, found = ast.parse(block), []
+    scope = {}
+    exec(
+        compile(
+            ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], []), "", "exec"
+        ),
+        scope,
+    )
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and isinstance(node.func.value, ast.Name)
+        ):
+            module = scope.get(node.func.value.id)
+            if module is not None:
+                function = getattr(module, node.func.attr)
+                inspect.signature(function).bind(*node.args, **{word.arg: word.value for word in node.keywords})
+                found.append(node.func.attr)
+    assert {"make_scene", "render_sequence", "backward_warp", "extrass", "unroll"} <= set(found)
 
 
 def test_the_cheap_ones_run(tmp_path, monkeypatch, capsys, instant_renderer):  # noqa: F811
