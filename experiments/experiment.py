@@ -3,6 +3,7 @@
 Data, training, tuning of the baselines, evaluation, report: each part resumes where an interrupted run left off.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -19,6 +20,7 @@ from essjax.deploy import method_cost
 from essjax.typing import PyTree
 from experiments import datasets, health
 from experiments import environment as machine
+from experiments.ahead import Ahead
 from experiments.alarm import no_alarm
 from experiments.checks import check_dataset, check_settings
 from experiments.classes import QUESTIONS, class_remark, evaluate_classes
@@ -108,7 +110,7 @@ def run_experiment(
         now = time.monotonic()
         seconds[name], clock = round(now - clock, 1), now
 
-    with no_alarm(), Phases(console) as phases:
+    with no_alarm(), Phases(console) as phases, contextlib.ExitStack() as stack:
         phases.show("data", text="reading" if data else "rendering")
 
         def on_frame(n: int, total: int) -> None:
@@ -116,6 +118,11 @@ def run_experiment(
 
         classifiers = [name for name in names if any(stage.ranges for stage in stages_of(name, configs[name]))]
         native = all(VARIANTS[name].method(configs[name]).info.native for name in names)
+        first = next(iter(_trainings(names, configs)), None)
+        steps = None
+        if first and data is None and not (out / "run.json").exists():  # else stages may have been trained already
+            stages = stages_of(first, configs[first])
+            steps = stack.enter_context(contextlib.closing(Ahead(stages, configs[first]))).steps
         dataset = datasets.prepare(config, data, out, on_frame, ranges=bool(classifiers), native=native)
         # Labels depend on the size of the image: a user's data has its own.
         size = (dataset.info.width, dataset.info.height)
@@ -124,12 +131,16 @@ def run_experiment(
         phases.show("data", 1.0, f"{len(dataset.sequences)} sequences")
         console.print(datasets.describe(dataset), soft_wrap=True)
         check_dataset(names, configs, dataset)
-        initial = _initial(names, configs, dataset)
+        # What training would refuse is refused here.
+        initial = {
+            name: initial_variables(stages_of(name, configs[name]), dataset, configs[name])
+            for name in _trainings(names, configs)
+        }
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / "run.json", wanted)  # from here on there is something to resume
         lap("data")
 
-        trained = _train_all(names, configs, folders, dataset, initial, eval_only, phases)
+        trained = _train_all(names, configs, folders, dataset, initial, eval_only, phases, steps)
         reports = stage_reports(trained)
         lap("training")
         # Of all sessions: the clock above saw only this one, which may have restored everything.
@@ -200,13 +211,12 @@ def run_experiment(
     return metrics
 
 
-def _initial(names: Sequence[str], configs: Mapping[str, Config], dataset: Dataset) -> dict[str, PyTree]:
-    """The initial variables of each variant that is trained; what training would refuse is refused here."""
-    found: dict[str, PyTree] = {}
+def _trainings(names: Sequence[str], configs: Mapping[str, Config]) -> dict[str, str]:
+    """The variants to be trained, in order, each with the one that it has its weights from, which is trained once."""
+    found: dict[str, str] = {}
     for name in names:
-        base, stages = trained_as(name), stages_of(name, configs[name])
-        if stages and base not in found:
-            found[base] = initial_variables(stages, dataset, configs[name])
+        if stages_of(name, configs[name]) and trained_as(name) not in found.values():
+            found[name] = trained_as(name)
     return found
 
 
@@ -218,16 +228,14 @@ def _train_all(
     initial: Mapping[str, PyTree],
     eval_only: bool,
     phases: Phases,
+    first_steps: Mapping[str, Any] | None,
 ) -> dict[str, Trained]:
-    """Train (or restore) each variant that ``names`` take their weights from, once."""
+    """Train (or restore) each variant that ``names`` take their weights from, once; the first with ``first_steps``."""
     trained: dict[str, Trained] = {}
-    for name in names:
-        base, config = trained_as(name), configs[name]
-        if base in trained or base not in initial:
-            continue
-        stages, folder = stages_of(name, config), folders[name]
+    for name, base in _trainings(names, configs).items():
+        config, stages, folder = configs[name], stages_of(name, configs[name]), folders[name]
         if eval_only:
-            variables, report = restore_stages(stages, dataset, config, folder, initial[base])
+            variables, report = restore_stages(stages, dataset, config, folder, initial[name])
         else:
             if not config.vgg and any(stage.vgg for stage in stages):
                 phases.console.print(
@@ -235,10 +243,11 @@ def _train_all(
                     soft_wrap=True,
                 )
             shown = _TrainingProgress(phases, "" if len(names) == 1 else f"{base}: ")
+            steps = None if trained else first_steps
             variables, report = train_stages(
-                stages, dataset, config, folder, initial[base], shown.on_step, shown.on_compile
+                stages, dataset, config, folder, initial[name], shown.on_step, shown.on_compile, steps
             )
-        trained[base] = Trained(initial[base], variables, config, report)
+        trained[base] = Trained(initial[name], variables, config, report)
     return trained
 
 

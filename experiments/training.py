@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +130,11 @@ def initial_state(stages: list[Stage], stage: Stage, variables: PyTree, batch: S
     return create_state(needed, stage.name, optimizer(), history=history)
 
 
+def make_step(stage: Stage, config: Config) -> Callable:
+    """The jitted step of a stage."""
+    return make_train_step(stage.objective, optimizer(), stage.name, compiler_options=config.compiler_options)
+
+
 def train_stages(
     stages: list[Stage],
     dataset: Dataset,
@@ -138,20 +143,30 @@ def train_stages(
     variables: PyTree,
     on_step: OnStep,
     on_compile: OnCompile = lambda stage: None,
+    steps: Mapping[str, Any] | None = None,
 ) -> tuple[PyTree, dict[str, Any]]:
     """Train all stages in order, from ``variables``; one with a checkpoint at the end of its budget is only restored.
+
+    Args:
+      stages: of a variant.
+      dataset: with a split to train on.
+      config: its settings.
+      out: folder of checkpoints and logs.
+      variables: the initial ones.
+      on_step: called after each step.
+      on_compile: called before a step is compiled, or waited for.
+      steps: stage -> its step, where it is being compiled already (``Ahead.steps``).
 
     Returns:
       The variables, and stage -> what ``train`` says of it.
     """
     report = {}
     for stage in stages:
-        transform = optimizer()
         state = initial_state(stages, stage, variables, first_batch(dataset, config, stage))
         checkpoints = Checkpoints(out / "checkpoints" / stage.name)
         try:
             state, report[stage.name] = train(
-                make_train_step(stage.objective, transform, stage.name, compiler_options=config.compiler_options),
+                (steps or {}).get(stage.name) or make_step(stage, config),
                 state,
                 make_batches(dataset, config, stage),
                 checkpoints,

@@ -13,6 +13,7 @@ from essjax.generate import plan
 from essjax.rollout import SS, alternate, every, stream_step, unroll
 from essjax.train import create_state, make_train_step, optimizer
 from experiments import datasets
+from experiments.ahead import batch_shapes, state_shapes
 from experiments.config import PRESETS
 from experiments.training import initial_variables, make_batches
 from experiments.variants import VARIANTS, config_of, stages_of
@@ -41,6 +42,11 @@ def dataset(tmp_path_factory):
     patch.undo()
 
 
+def assert_same_shapes(expected, actual):
+    described = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (expected, actual)]
+    assert described[0] == described[1]
+
+
 def train(name, dataset):
     """Train every stage of a variant on one batch; stage -> losses, and the variables."""
     config = config_of(name, "smoke", SIZES)
@@ -52,6 +58,9 @@ def train(name, dataset):
         names = [s.name for s in stages[: stages.index(stage) + 1]]
         state = create_state({entry: variables[entry] for entry in names}, stage.name, transform)
         batch, losses[stage.name] = next(make_batches(dataset, config, stage)), []
+        expected = batch_shapes(config, stage)  # what the run command compiles for, before there are data
+        assert_same_shapes(expected, batch)
+        assert_same_shapes(state_shapes(stages, stage, expected), state)
         for _ in range(STEPS):
             state, terms = step(state, batch, stage.learning_rate)
             losses[stage.name].append(float(terms["loss"]))

@@ -11,6 +11,7 @@ import pytest
 from essjax.data import Rounds
 from essjax.generate import generate, plan
 from experiments import datasets
+from experiments.ahead import batch_shapes
 from experiments.config import make_config
 from experiments.training import make_batches
 from experiments.variants import config_of, stages_of
@@ -43,6 +44,17 @@ def test_the_second_round_is_of_other_scenes_and_looks_alike(dataset, monkeypatc
 
 def test_without_it_batches_are_as_ever(dataset, monkeypatch):
     assert not isinstance(batches(dataset, monkeypatch), Rounds)
+
+
+def test_shapes_are_known_before_there_are_scenes(dataset, monkeypatch):
+    """What the run command compiles for while the data renders."""
+    config = config_of("extrass", "smoke", SETTINGS)
+    expected = batch_shapes(config, stages_of("extrass", config)[-1])
+    shapes = [
+        jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+        for tree in (expected, next(batches(dataset, monkeypatch)))
+    ]
+    assert shapes[0] == shapes[1]
 
 
 def test_imported_data_has_no_new_scenes(dataset, monkeypatch):

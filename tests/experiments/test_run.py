@@ -46,7 +46,7 @@ def test_metrics_json(finished):
     assert metrics["configs"]["extrass"]["size"] == [32, 24] and metrics["configs"]["extrass"]["width"] == 8
     assert {"commit", "device", "versions", "seed"} <= set(metrics["environment"])
     phases = {"data", "compilation", "training", "tuning", "evaluation", "report", "total"}
-    assert set(metrics["seconds"]) == phases and metrics["seconds"]["compilation"] > 0
+    assert set(metrics["seconds"]) == phases and metrics["seconds"]["compilation"] >= 0
     assert {stage: found["steps"] for stage, found in metrics["training"].items()} == metrics["environment"]["steps"]
     assert metrics["dead"] == [] and len(metrics["warnings"]) == 2
     means = {(r["method"], r["frames"], r["resolution"]): r for r in metrics["rows"] if r["sequence"] == "mean"}
