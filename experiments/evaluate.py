@@ -17,8 +17,8 @@ from essjax.color import display
 from essjax.data import Dataset, Segment, read_segment
 from essjax.data.memory import Kept
 from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
-from essjax.interfaces import Method
-from essjax.metrics import PHASES, aggregate, mean_over, psnr, score_rollout
+from essjax.interfaces import Method, expand_flag
+from essjax.metrics import PHASES, aggregate, has_source, mean_over, psnr, score_rollout
 from essjax.rollout import ESS, SS, Schedule, alternate, check_supported, every, stream_step
 from essjax.typing import Array, PyTree
 from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
@@ -121,9 +121,10 @@ class Clips(collections.abc.Sequence[Clip]):
 def estimated_valid(frames: Frame) -> Array:
     """``hole_mask`` of each frame against the one before, ``[T, H, W, 1]``; of the first against itself."""
     previous = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), frames)
-    return hole_mask(
+    valid = hole_mask(
         frames.gbuffers, previous.gbuffers, frames.motion, jitter=frames.jitter, jitter_previous=previous.jitter
     )
+    return jnp.where(expand_flag(frames.cut, valid.ndim), 0.0, valid)  # as the renderer says it
 
 
 class Runner:
@@ -204,15 +205,15 @@ def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str,
             **{name: float(values[n]) if np.isfinite(values[n]) else None for name, values in extra.items()},
         }
         for n in clip.scored
-        if kinds[n] in method.info.predicts and has_image(clip, n, method)
+        if kinds[n] in method.info.predicts and has_image(clip, n, method, kinds)
     ]
 
 
-def has_image(clip: Clip, n: int, method: Method) -> bool:
-    """Whether ``method`` shows frame ``n``: one that lags needs as many later frames of the same shot."""
-    late = method.info.latency
-    following = np.asarray(clip.sequence.frames.cut)[n + 1 : n + 1 + late]
-    return len(following) == late and not following.any()
+def has_image(clip: Clip, n: int, method: Method, kinds: collections.abc.Sequence[str]) -> bool:
+    """Whether ``method`` shows frame ``n``: something was rendered in its shot, also later if it lags."""
+    cuts, late = np.asarray(clip.sequence.frames.cut), method.info.latency
+    following = cuts[n + 1 : n + 1 + late]
+    return bool(has_source(kinds, cuts)[n]) and len(following) == late and not following.any()
 
 
 def picture_frames(clip: Clip, count: int) -> list[int]:
@@ -253,7 +254,7 @@ def evaluate(
             curves[name][clip.name] += score_clip(runner.method, clip, images, kinds)
             for n in picture_frames(clip, pictures):
                 with lock:
-                    if not has_image(clip, n, runner.method):
+                    if not has_image(clip, n, runner.method, kinds):
                         continue
                     _collect_picture(shown, clip, n, name, runner.method, images, kinds)
 

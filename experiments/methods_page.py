@@ -18,11 +18,13 @@ class Entry(NamedTuple):
       paper: where it comes from.
       idea: one or two sentences.
       unknown: what the paper does not say and what we chose, in short.
+      reactive: what becomes of a reactive pixel in an extrapolated frame.
     """
 
     paper: str
     idea: str
     unknown: str
+    reactive: str = "–"
 
 
 ENTRIES: dict[str, Entry] = {
@@ -32,33 +34,47 @@ ENTRIES: dict[str, Entry] = {
         "rendered and extrapolated frames alike",
         "FRNet's layers, all sigmas, how the output is composed: coarse-to-fine flow after IFRNet, tuned sigmas, a "
         "blend of clamped history and samples plus a residual",
+        "nothing of the history at output resolution",
     ),
-    "extrass-e": Entry("ExtraSS 2023", "its low-resolution part: guided warp, then FRNet's flow", "as above"),
+    "extrass-e": Entry(
+        "ExtraSS 2023",
+        "its low-resolution part: guided warp, then FRNet's flow",
+        "as above",
+        "no: the guided warp goes by G-buffers alone",
+    ),
     "extrass-w": Entry(
-        "ExtraSS 2023", "its guided warp alone: 33 candidates, the 4 most similar are blended", "sigmas"
+        "ExtraSS 2023", "its guided warp alone: 33 candidates, the 4 most similar are blended", "sigmas", "no: as above"
     ),
     "extranet": Entry(
         "ExtraNet 2021",
         "plain and occlusion-aware warps of the last frame, holes filled by a gated U-Net that also sees three encoded "
         "earlier frames",
         "thresholds of the holes depend on the scene's scale: ours are in pixel footprints",
+        "a hole",
     ),
     "extranet+taa": Entry(
         "ExtraSS 2023, Table 3",
         "ExtraNet at output resolution, TAA behind it",
         "TAA's settings: its defaults, not tuned",
+        "a hole",
     ),
     "extranet-plus": Entry(
-        "FASSET", "ExtraNet fed zero-padded high-resolution frames", "its 0.10 M parameters are not the released net's"
+        "FASSET",
+        "ExtraNet fed zero-padded high-resolution frames",
+        "its 0.10 M parameters are not the released net's",
+        "a hole",
     ),
     "fasset": Entry(
         "FASSET",
         "one recurrent gated U-Net for both kinds, its features decoded at any output size by an implicit MLP",
         "widths, the recurrent module, what the hidden state is warped by",
+        "a hole",
     ),
-    "extranet+nsrr": Entry("FASSET, Table 2", "extrapolates at low resolution, then supersamples every frame", "–"),
+    "extranet+nsrr": Entry(
+        "FASSET, Table 2", "extrapolates at low resolution, then supersamples every frame", "–", "a hole"
+    ),
     "nsrr+extranet": Entry(
-        "FASSET, Table 2", "supersamples rendered frames, then extrapolates at high resolution", "–"
+        "FASSET, Table 2", "supersamples rendered frames, then extrapolates at high resolution", "–", "a hole"
     ),
     "dlctus": Entry(
         "DLCTUS thesis",
@@ -82,21 +98,35 @@ ENTRIES: dict[str, Entry] = {
         "Kong et al. 2022",
         "flows to both neighbours, coarse to fine, with an intermediate feature",
         "jitter of its inputs",
+        "no: both neighbours are read everywhere",
     ),
     "ifrnet+taa": Entry(
-        "ExtraSS 2023, Table 3", "IFRNet at output resolution, TAA behind it", "TAA's settings: its defaults, not tuned"
+        "ExtraSS 2023, Table 3",
+        "IFRNet at output resolution, TAA behind it",
+        "TAA's settings: its defaults, not tuned",
+        "no: as above",
     ),
     "bsr": Entry(
-        "Yang et al. 2011", "fixed-point search for each pixel in both neighbours, then a blend", "iterations"
+        "Yang et al. 2011",
+        "fixed-point search for each pixel in both neighbours, then a blend",
+        "iterations",
+        "no: as above",
     ),
-    "3d-warp": Entry("Mark et al. 1997", "both neighbours splatted to the middle by motion and depth", "hole filling"),
+    "3d-warp": Entry(
+        "Mark et al. 1997", "both neighbours splatted to the middle by motion and depth", "hole filling", "no: as above"
+    ),
     "tus": Entry("DLCTUS thesis", "TAAU with the thesis' own settings", "–"),
     "taau": Entry(
         "Yang et al. 2020", "temporal accumulation of jittered samples on the output grid", "best setting, tuned"
     ),
-    "taau-half": Entry("–", "TAAU on rendered frames, its output warped in between", "best setting, tuned"),
+    "taau-half": Entry(
+        "–",
+        "TAAU on rendered frames, its output warped in between",
+        "best setting, tuned",
+        "warped all the same: there is nothing else; new in the next rendered frame",
+    ),
     "taa": Entry("Karis 2014", "temporal accumulation at native resolution", "best setting, tuned"),
-    "warp": Entry("–", "bilinear warp of the last rendered frame", "–"),
+    "warp": Entry("–", "bilinear warp of the last rendered frame", "–", "no: there is nothing else to show"),
     "jau": Entry("DLCTUS thesis", "upsampling that knows where the samples lie", "–"),
     "bilinear": Entry("–", "upsampling that does not", "–"),
     "bicubic": Entry("–", "the same, bicubic", "–"),
@@ -109,8 +139,11 @@ must have beyond that. Parameters and multiply-adds are those of the traced step
 per frame of {WIDTH}x{HEIGHT} input ({2 * WIDTH}x{2 * HEIGHT} for those marked native); element-wise work and warps are
 not counted. Latency: later frames that an image waits for. What we chose in detail: [deviations.md](deviations.md).
 
-| method | from | idea | also needs | kinds | parameters | 10⁹ multiply-adds SS / ESS | latency | we had to choose |
-|---|---|---|---|---|---:|---:|---:|---|
+Where a frame's reactive mask is 1, a *rendered* frame shows nothing of its history, whatever the method
+(`tests/methods/test_shots.py`); the last column but one says what such a pixel is in an *extrapolated* frame.
+
+| method | from | idea | also needs | kinds | parameters | 10⁹ multiply-adds SS / ESS | latency | reactive | we chose |
+|---|---|---|---|---|---:|---:|---:|---|---|
 """
 
 
@@ -126,7 +159,7 @@ def line(name: str, entry: Entry) -> str:
     needs = ", ".join(sorted(info.requires)) or "–"
     cells = (
         f"`{name}`", entry.paper, entry.idea, needs, kinds, f"{cost.parameters:,}" if cost.parameters else "–", work,
-        str(cost.latency), entry.unknown,
+        str(cost.latency), entry.reactive, entry.unknown,
     )  # fmt: skip
     return f"| {' | '.join(cells)} |"
 

@@ -12,7 +12,7 @@ import numpy as np
 from essjax.color import display
 from essjax.frames import without_color
 from essjax.interfaces import Method
-from essjax.metrics import psnr
+from essjax.metrics import has_source, psnr
 from essjax.rollout import SS, check_supported
 from essjax.typing import Array
 from experiments.config import Config
@@ -81,10 +81,12 @@ def _score_grid(method: Method, grid: np.ndarray, clip: Clip) -> np.ndarray:
     for schedule in schedules(method):
         check_supported(method, frames, schedule)
         history = steps["start"](variables, frame_with_batch_axis(frames, 0))
-        for n, kind in enumerate(schedule.kinds(len(clip.numbers))):
+        kinds = schedule.kinds(len(clip.numbers))
+        made = has_source(kinds, np.asarray(frames.cut))
+        for n, kind in enumerate(kinds):
             frame = frame_with_batch_axis(frames, n)
             history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
-            if n in clip.scored:
+            if n in clip.scored and made[n]:
                 totals += np.asarray(_grid_psnr(image[:, 0], clip.sequence.reference[n]))
                 count += 1
     return totals / max(count, 1)

@@ -147,21 +147,17 @@ def cuts_of(source: Source, index: int) -> np.ndarray:
 
 
 def windows(source: Source, length: int) -> list[tuple[int, int]]:
-    """All ``(sequence, start)`` such that ``length`` frames from ``start`` hold no cut after their first frame.
+    """All ``(sequence, start)`` of ``length`` frames in a row, cuts or not.
 
     Raises:
       ValueError: there is none.
     """
-    found, longest = [], 0
-    for index in range(len(source)):
-        cut = cuts_of(source, index)
-        longest = max(longest, len(cut))
-        starts = range(len(cut) - length + 1)
-        found += [(index, start) for start in starts if not cut[start + 1 : start + length].any()]
+    lengths = [len(cuts_of(source, index)) for index in range(len(source))]
+    found = [(index, start) for index, frames in enumerate(lengths) for start in range(frames - length + 1)]
     if not found:
         raise ValueError(
-            f"clips: no {length} consecutive frames without a cut in {len(source)} sequences (the longest has "
-            f"{longest} frames). Use a smaller length or longer sequences."
+            f"clips: no {length} frames in a row in {len(source)} sequences (the longest has {max(lengths, default=0)} "
+            "frames). Use a smaller length or longer sequences."
         )
     return found
 
@@ -271,7 +267,7 @@ def clips(
 
     Args:
       source: a list of sequences, ``disk_source`` or any ``Source``.
-      length: frames per clip; a cut is at most its first frame.
+      length: frames per clip; the first is a cut, and so is any that is one in its sequence.
       batch: clips per batch.
       crop: (height, width) in LR pixels, at random whole LR pixels; the reference is cut to match. None: whole frames.
       flips: mirror half of the clips left-right and half top-bottom.

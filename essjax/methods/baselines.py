@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse
 from essjax.frames import Frame, Prediction, rendered_color
-from essjax.interfaces import Method, MethodInfo, no_variables, reset_at_cut
+from essjax.interfaces import Method, MethodInfo, no_variables
+from essjax.methods.shots import within_shots
 from essjax.typing import Array, Callable, Image, PyTree
 from essjax.warp import backward_warp, compose_motion, jitter_aligned_upsample, jittered_motion
 
@@ -23,7 +24,7 @@ def jau_image(frame: Frame, scale: float, mode: str = "bilinear") -> Array:
 
 
 def _spatial(name: str, scale: float, upscale: Callable[[Frame], Array]) -> Method:
-    """A method that upscales each rendered frame by itself and repeats the last image on frames without colour."""
+    """A method that upscales each rendered frame by itself and repeats it on frames without colour."""
 
     def start(example: Frame) -> PyTree:
         *leading, height, width, _ = example.motion.shape
@@ -37,7 +38,7 @@ def _spatial(name: str, scale: float, upscale: Callable[[Frame], Array]) -> Meth
         return history, Prediction(image=history["image"])
 
     info = MethodInfo(name=name, scale=scale, predicts=frozenset({"ss"}))
-    return Method(no_variables, start, render_step, extrapolate_step, info)
+    return within_shots(Method(no_variables, start, render_step, extrapolate_step, info))
 
 
 def _without_jitter(frame: Frame) -> Frame:
@@ -96,7 +97,7 @@ def warp(*, blur: float = 0.0) -> Method:
 
     Not demodulated, jitter difference included, border repeated, one resampling however many frames are
     extrapolated in a row: motion is composed along the path back to the rendered frame. A rendered frame is stored
-    and returned as it is. An extrapolated frame right after a cut has no source: it shows the frame before the cut.
+    and returned as it is.
 
     Args:
       blur: standard deviation in pixels of a Gaussian on the frame before the warp. It removes noise, and nothing
@@ -130,10 +131,9 @@ def warp(*, blur: float = 0.0) -> Method:
         motion, valid = compose_motion(
             frame.motion, history["motion"], jitter=frame.jitter, jitter_previous=history["motion_jitter"]
         )
-        motion = reset_at_cut(frame.cut, jnp.zeros_like(motion), motion)
         image = backward_warp(history["color"], jittered_motion(motion, frame.jitter, history["color_jitter"]))
         history = {**history, "motion": motion, "motion_jitter": frame.jitter}
         return history, Prediction(image=image, aux={"valid": valid})
 
     info = MethodInfo(name="warp-blur" if blur else "warp", scale=1, predicts=frozenset({"ess"}))
-    return Method(no_variables, start, render_step, extrapolate_step, info)
+    return within_shots(Method(no_variables, start, render_step, extrapolate_step, info))

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import Frame, Prediction, depth_scale, rendered_color
 from essjax.interfaces import Method, MethodInfo, Network, expand_flag, refuse_extrapolation, reset_at_cut
+from essjax.methods.shots import upsampled_reactive
 from essjax.networks import classifier_network, composition_network
-from essjax.networks.blocks import nearest_upsample
 from essjax.typing import Array, Color, Flag, Image, Mask, Motion, Plane, pytree
 from essjax.warp import (
     Resampled,
@@ -67,12 +67,14 @@ class Current(NamedTuple):
       samples: the nearest samples: their weight and their box in YCoCg.
       closeness: of the nearest sample.
       motion: of the nearest sample's 3 x 3 neighbourhood's closest surface, output pixels.
+      trust: 1 - reactive of the nearest sample, ``[..., sH, sW, 1]``; 1 without a mask.
     """
 
     color: Color
     samples: Resampled
     closeness: Plane
     motion: Motion
+    trust: Array | float
 
 
 class Warped(NamedTuple):
@@ -85,7 +87,7 @@ class Warped(NamedTuple):
       high: the same.
       closeness: of the previous frame.
       logits: read bilinearly; 0 where there is no history.
-      known: ``[..., sH, sW, 1]``: 1 where there is history (not off screen, not cut).
+      known: ``[..., sH, sW, 1]``: 1 where there is history (not off screen, not cut, not reactive).
     """
 
     image: Color
@@ -110,17 +112,19 @@ def look(frame: Frame, unit: Array, scale: int, sigma: float) -> Current:
     motion = upsample_motion(
         dilate_motion(frame.motion, frame.gbuffers.depth), scale, jitter=frame.jitter, mode="nearest"
     )
+    reactive = upsampled_reactive(frame, scale)
     return Current(
         color=jnp.clip(jitter_aligned_upsample(color, scale, frame.jitter, mode="bicubic"), 0.0, 1.0),
         samples=samples,
         closeness=jitter_aligned_upsample(closeness(frame, unit), scale, frame.jitter, mode="nearest"),
         motion=jax.lax.stop_gradient(motion),
+        trust=1.0 if reactive is None else 1.0 - reactive,
     )
 
 
 def warp_history(history: History, current: Current) -> Warped:
     """Counter, range and depth are read nearest, logits bilinearly (section 3), the image bicubically."""
-    known = inside_mask(current.motion) * ~expand_flag(history.empty, current.motion.ndim)
+    known = inside_mask(current.motion) * ~expand_flag(history.empty, current.motion.ndim) * current.trust
     exact = jnp.concatenate([history.counter, history.low, history.high, history.closeness], axis=-1)
     exact = backward_warp(exact, current.motion, mode="nearest")
     there = known > 0
@@ -163,7 +167,7 @@ def probabilities(logits: Image, distrust: Mask) -> tuple[Image, Image]:
     """Ghosting and aliasing probabilities ``[..., 3]``; where ``distrust`` is 1 it is visibility ghosting for sure."""
     ghosting, aliasing = jax.nn.softmax(logits[..., :3]), jax.nn.softmax(logits[..., 3:])
     certain = jnp.array([1.0, 0.0, 0.0], ghosting.dtype)
-    return ghosting + distrust * (certain - ghosting), aliasing
+    return (1.0 - distrust) * ghosting + distrust * certain, aliasing
 
 
 def rectify(image: Color, current: Current, ghosting: Image) -> Color:
@@ -246,10 +250,7 @@ def classifier(
         warped = warp_history(history, current)
         inputs = classifier_inputs(current, warped)
         logits, state = network.apply(variables["classifier"], inputs, train=train)
-        distrust = 1.0 - warped.known
-        if frame.reactive is not None:
-            distrust = jnp.maximum(distrust, nearest_upsample(frame.reactive, scale))
-        ghosting, aliasing = probabilities(logits, distrust)
+        ghosting, aliasing = probabilities(logits, 1.0 - warped.known)
         rejected = ghosting[..., :1]
         counter = (1.0 - rejected) * (warped.counter + 1.0)
         rectified = rectify(warped.image, current, ghosting)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from essjax.frames import Frame, Prediction, without_color
 from essjax.interfaces import Method, MethodInfo, Step, no_variables
+from essjax.methods.shots import continued
 from essjax.methods.taau import taa
 from essjax.typing import Callable, Color
 
@@ -30,7 +31,8 @@ def composed(
     """``second.render_step`` on every image of ``first``, or ``second``'s step of the frame's own kind.
 
     ``variables`` are those of both, side by side. ``aux`` is the second's, and the first's prediction as ``"first"``.
-    Where the first lags behind (interpolation), the second sees the frame that the image belongs to.
+    Where the first lags behind (interpolation), the second sees the frame that the image belongs to. A ``second`` that
+    takes all frames for rendered starts anew with the first one that was: it does not trust ``shots.unlit`` either.
 
     Args:
       name: of the whole.
@@ -58,16 +60,20 @@ def composed(
 
     def start(example):
         history = {"first": first.start(example), "second": second.start(blank(example))}
-        # A copy: a streaming step donates its history.
-        return {**history, "frame": jax.tree.map(jnp.copy, without_color(example))} if late else history
+        history["empty"] = jnp.ones(example.cut.shape, bool)  # nothing was rendered since the last cut
+        if late:  # a copy: a streaming step donates its history
+            history["frame"] = jax.tree.map(jnp.copy, without_color(continued(example, history["empty"])))
+        return history
 
-    def after(step: Step, then: Step) -> Step:
+    def after(step: Step, then: Step, *, rendered: bool) -> Step:
         def run(variables, history, frame, *, train=False):
             earlier, made = step(variables, history["first"], frame, train=train)
-            shown = between(history["frame"] if late else frame, made.image)
+            seen = continued(frame, history["empty"])
+            shown = between(history["frame"] if late else seen, made.image)
             later, result = then(variables, history["second"], shown, train=train)
-            history = {"first": earlier, "second": later}
-            history = {**history, "frame": without_color(frame)} if late else history
+            empty = jnp.zeros_like(seen.cut) if rendered else seen.cut
+            history = {"first": earlier, "second": later, "empty": empty}
+            history = {**history, "frame": without_color(seen)} if late else history
             aux = {**result.aux, "first": made}
             return history, Prediction(image=result.image, aux=aux, state={**made.state, **result.state})
 
@@ -85,8 +91,8 @@ def composed(
     return Method(
         init,
         start,
-        after(first.render_step, second.render_step),
-        after(first.extrapolate_step, extrapolate),
+        after(first.render_step, second.render_step, rendered=True),
+        after(first.extrapolate_step, extrapolate, rendered=False),
         info,
     )
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from essjax.cameras import pixel_positions
 from essjax.color import reinhard, reinhard_inverse
 from essjax.frames import Frame, Prediction, rendered_color
-from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
+from essjax.interfaces import Method, MethodInfo, refuse_extrapolation
+from essjax.methods.shots import continued, without_history
 from essjax.networks import dlctus_network
 from essjax.typing import Array, Callable, Image, Motion, Plane
 from essjax.warp import (
@@ -87,10 +88,10 @@ def dlctus(
 ) -> Method:
     """Deep Learning Controlled Temporal Upsampling: 78,112 parameters for both factors, every frame rendered.
 
-    Each frame: history is reprojected with bilinearly upsampled motion; off screen, on the first frame and at a cut it
-    is the JAU frame, whose accumulation is 1. The network sees the zero-upsampled RGB-D and that history, and returns
-    o1 and o2, clamped to [0, 1]: ``JAU o1 + history (1 - o1)`` on all four channels (eq 44), then the accumulation
-    times o2 (eq 45).
+    Each frame: history is reprojected with bilinearly upsampled motion; off screen, on the first frame, at a cut and as
+    far as a frame is reactive it is the JAU frame, whose accumulation is 1. The network sees the zero-upsampled RGB-D
+    and that history, and returns o1 and o2, clamped to [0, 1]: ``JAU o1 + history (1 - o1)`` on all four channels (eq
+    44), then the accumulation times o2 (eq 45).
 
     Variables are ``{"dlctus": ...}``; reprojection and dilation may differ between training and test (tables 13, 14).
     ``aux`` has ``encoded``, the image in x / (1 + x), ``rate`` (o1) and ``accumulation`` (the fourth channel, or None).
@@ -132,7 +133,7 @@ def dlctus(
         motion = dilate_motion(frame.motion, frame.gbuffers.depth) if dilate else frame.motion
         motion = jax.lax.stop_gradient(upsample_motion(motion, scale, jitter=frame.jitter))
         past = jnp.where(inside_mask(motion) > 0, REPROJECTIONS[reprojection](history["image"], motion), fallback)
-        return reset_at_cut(frame.cut | history["empty"], fallback, past)
+        return without_history(past, fallback, continued(frame, history["empty"]), scale)
 
     def render_step(variables, history, frame: Frame, *, train: bool = False):
         color = reinhard(rendered_color(frame, name))

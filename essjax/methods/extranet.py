@@ -16,6 +16,7 @@ from essjax.color import demodulate, expm1, log1p, modulate
 from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require, surface_guides
 from essjax.interfaces import Method, MethodInfo, expand_flag
 from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, push, reset_memory, start_memory
+from essjax.methods.shots import within_shots
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import from_torch as network_from_torch
 from essjax.tensors import read_tensors
@@ -92,7 +93,7 @@ def network_inputs(
     """Warps, masks and features for ``frame``, to which ``memory`` was advanced; no gradient.
 
     Every rendered frame is warped along its own composed path and has a hole mask of its own (section 4.4), 0 where
-    the path leaves the screen or nothing was rendered yet. Jitter differences are part of every warp.
+    the path leaves the screen, is reactive or nothing was rendered yet. Jitter differences are part of every warp.
 
     Args:
       memory: of rendered frames.
@@ -111,8 +112,8 @@ def network_inputs(
     surfaces = jax.tree.map(share, frame.gbuffers)
     valid = hole_mask(surfaces, kept.gbuffers, frames.motion, jitter=jitter, jitter_previous=frames.jitter)
     valid = jnp.where(expand_flag(memory.count == 0, valid.ndim - 1), 0.0, valid * frames.valid)
-    if frame.reactive is not None:
-        valid = valid * (1.0 - frame.reactive)
+    if frames.trust is not None:
+        valid = valid * frames.trust
     shading = jnp.where(background(kept.gbuffers), 0.0, kept.shading) if published else kept.shading
     plain = log1p(backward_warp(shading, motion, mode=mode))
     warped = [plain[0]]
@@ -171,7 +172,7 @@ def extranet(*, history: bool = True, occlusion: bool = True, published: bool = 
         return memory, Prediction(image=image, aux=aux, state={"extranet": state} if state else {})
 
     info = MethodInfo("extranet", scale=1, requires=REQUIRES, predicts=frozenset({"ess"}))
-    return Method(init, _start, render_step, extrapolate_step, info)
+    return within_shots(Method(init, _start, render_step, extrapolate_step, info))
 
 
 def from_torch(weights: str | Path | Mapping[str, Array]) -> PyTree:

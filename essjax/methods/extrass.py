@@ -30,6 +30,7 @@ from essjax.methods.rendered import (
     reset_pair,
     start_pair,
 )
+from essjax.methods.shots import within_shots, without_history
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import nearest_upsample
 from essjax.typing import Array, Color, Image, Jitter, Mask, pytree
@@ -57,7 +58,6 @@ class History:
       gbuffers: of the last frame, rendered or not: those that marking holes needs.
       jitter: of the last frame.
       depth_scale: unit of depth, ``[...]``.
-      empty: bool ``[...]``: no output yet since the cut.
     """
 
     rendered: Memory
@@ -65,7 +65,6 @@ class History:
     gbuffers: GBuffers
     jitter: Jitter
     depth_scale: Array
-    empty: Array
 
 
 @pytree
@@ -91,7 +90,7 @@ def warp_history(history: History, frame: Frame, scale: int) -> Warped:
         frame.gbuffers, history.gbuffers, frame.motion, jitter=frame.jitter, jitter_previous=history.jitter
     )
     valid_low = _mean_of_nine(valid_low)  # softly: at silhouettes a mask is half wrong
-    valid_low = jnp.where(history.empty[..., None, None, None], 0.0, valid_low)
+    valid_low = jnp.where(frame.cut[..., None, None, None], 0.0, valid_low)
     if frame.reactive is not None:
         valid_low = valid_low * (1.0 - frame.reactive)
     valid = nearest_upsample(valid_low, scale) * inside_mask(motion)
@@ -175,7 +174,6 @@ def extrass(
             gbuffers=jax.tree.map(jnp.copy, hole_buffers(example.gbuffers)),  # a streaming step donates its history
             jitter=jnp.copy(example.jitter),
             depth_scale=depth_scale(example.gbuffers),
-            empty=jnp.ones(example.cut.shape, bool),
         )
 
     def reset(frame: Frame, history: History) -> History:
@@ -205,9 +203,12 @@ def extrass(
         return [], [log1p(warp), surface_guides(frame.gbuffers)[0]]
 
     def _inputs(frame: Frame, history: History, warped: Warped, color: Color, extra: list[Image]):
-        """Inputs of E0 or E1 at LR, and the LR colour (log1p) resampled to the HR grid."""
+        """Inputs of E0 or E1 at LR, the LR colour (log1p) resampled to the HR grid, and the usable history."""
         encoded = log1p(color)
         current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), scale)
+        # Before the network sees it: what is reactive may not reach the output at all.
+        kept = without_history(warped.log_image, current.color, frame, scale)
+        warped = dataclasses.replace(warped, log_image=kept)
         shape = frame.gbuffers.depth.shape[:-1]
         low = [
             encoded,
@@ -217,7 +218,7 @@ def extrass(
             *extra,
         ]
         high = [space_to_depth(current.color, scale), space_to_depth(warped.log_image, scale)]
-        return jnp.concatenate([*high, *low], axis=-1), current
+        return jnp.concatenate([*high, *low], axis=-1), current, warped
 
     def _finish(history: History, frame: Frame, rendered: Memory, log_image: Image) -> tuple[History, Color]:
         image = expm1(log_image)
@@ -227,7 +228,6 @@ def extrass(
             image=image,
             gbuffers=hole_buffers(frame.gbuffers),
             jitter=frame.jitter,
-            empty=jnp.zeros_like(history.empty),
         )
         return history, image
 
@@ -235,7 +235,7 @@ def extrass(
         history = reset(frame, history)
         warped = warp_history(history, frame, scale)
         color = rendered_color(frame, info.name)
-        inputs, current = _inputs(frame, history, warped, color, _extras(frame, color)[0])
+        inputs, current, warped = _inputs(frame, history, warped, color, _extras(frame, color)[0])
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
         weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98)
         log_image = _compose(head, warped, current, weight, scale)
@@ -249,7 +249,7 @@ def extrass(
         warped = warp_history(history, frame, scale)
         rendered = advance(history.rendered, frame)
         low = extrapolate(flow_network, variables["frnet"], rendered, frame, sigmas)
-        inputs, current = _inputs(frame, history, warped, low.image, _extras(frame, low.warp)[1])
+        inputs, current, warped = _inputs(frame, history, warped, low.image, _extras(frame, low.warp)[1])
         (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="extrapolate")
         log_image = _compose(head, warped, current, EXTRAPOLATED_SHARE, scale)
         history, image = _finish(history, frame, rendered, log_image)
@@ -257,4 +257,4 @@ def extrass(
         return history, Prediction(image=image, aux=aux)
 
     info = MethodInfo("extrass", scale=scale, requires=GUIDED)
-    return Method(init, start, render_step, extrapolate_step, info)
+    return within_shots(Method(init, start, render_step, extrapolate_step, info))

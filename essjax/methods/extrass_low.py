@@ -10,6 +10,7 @@ from essjax.color import expm1, log1p, sum_channels
 from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require, select_time, surface_guides
 from essjax.interfaces import Method, MethodInfo, Network, no_variables
 from essjax.methods.rendered import GUIDED, Memory, advance, guided_extrapolation, push_pair, reset_pair, start_pair
+from essjax.methods.shots import within_shots
 from essjax.networks import frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
 from essjax.typing import Array, Color, Image, Mask, PyTree, pytree
@@ -42,7 +43,7 @@ def extrass_w(
         return history, Prediction(image=image, aux={"warp": image})
 
     info = MethodInfo("extrass-w", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
-    return Method(no_variables, start_pair, render_step, extrapolate_step, info)
+    return within_shots(Method(no_variables, start_pair, render_step, extrapolate_step, info))
 
 
 def _store(history: Memory, frame: Frame) -> Memory:
@@ -171,4 +172,4 @@ def extrass_e(
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
     info = MethodInfo("extrass-e", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
-    return Method(init, start_pair, render_step, extrapolate_step, info)
+    return within_shots(Method(init, start_pair, render_step, extrapolate_step, info))

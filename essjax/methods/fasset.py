@@ -24,6 +24,7 @@ from essjax.frames import (
 )
 from essjax.interfaces import Method, MethodInfo, reset_at_cut
 from essjax.methods.rendered import GUIDED, Memory, advance, hole_buffers, push, reset_memory, start_memory
+from essjax.methods.shots import within_shots
 from essjax.typing import Color, Image, Mask, Scalar, pytree
 from essjax.warp import backward_warp, fill_holes, hole_mask, jitter_aligned_upsample, jittered_motion
 
@@ -65,7 +66,8 @@ class Arrival(NamedTuple):
       color: of the last rendered frame, 0 in holes.
       hidden: its recurrent state, 0 in holes.
       valid: 1 where the last rendered frame showed this surface, 0 in holes, ``[..., H, W, 1]``.
-      recent: 1 where the last frame, rendered or not, did; 1 everywhere if there was none.
+      recent: 1 where the last frame, rendered or not, did; 1 everywhere if there was none, and where the
+        frame is reactive.
     """
 
     color: Color
@@ -103,13 +105,16 @@ def _arrive(history: History, frame: Frame, width: int) -> tuple[History, Arriva
         frame.gbuffers, last.content.surfaces, last.motion, jitter=frame.jitter, jitter_previous=last.jitter
     )
     valid = jnp.where(empty, 0.0, same * last.valid)
-    if frame.reactive is not None:
-        valid = valid * (1.0 - frame.reactive)
+    recent = jnp.where(empty, 1.0, recent)
+    if frame.reactive is not None and last.trust is not None:
+        valid = valid * last.trust
+        # What a reactive pixel shows is its own sample: nothing is cut out of it.
+        recent = jnp.maximum(recent, frame.reactive)
     lookup = jax.lax.stop_gradient(jittered_motion(last.motion, frame.jitter, last.jitter))
     both = jnp.concatenate([jax.lax.stop_gradient(last.content.color), last.content.hidden], axis=-1)
     warped = valid * backward_warp(both, lookup)
     history = History(rendered=memory, surfaces=_surfaces(frame.gbuffers), depth_scale=unit)
-    return history, Arrival(warped[..., :3], warped[..., 3:], valid, jnp.where(empty, 1.0, recent))
+    return history, Arrival(warped[..., :3], warped[..., 3:], valid, recent)
 
 
 def fasset(
@@ -181,7 +186,7 @@ def fasset(
         return history, Prediction(image=expm1(log_image), aux={"log_image": log_image, "mask": mask, "valid": mask})
 
     info = MethodInfo(name, scale=scale, requires=GUIDED)
-    return Method(init, start, render_step, extrapolate_step, info)
+    return within_shots(Method(init, start, render_step, extrapolate_step, info))
 
 
 def _guides(history: History, frame: Frame) -> Image:

@@ -12,6 +12,7 @@ from essjax.methods.composed import composed
 from essjax.methods.extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
 from essjax.methods.nsrr import nsrr
 from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, push, reset_memory, start_memory
+from essjax.methods.shots import within_shots
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import extranet as extranet_network
 from essjax.typing import Color, Image
@@ -143,4 +144,4 @@ def extranet_plus(scale: int = 2) -> Method:
         return memory, Prediction(image=image, aux=aux, state={"extranet_plus": state} if state else {})
 
     info = MethodInfo("extranet-plus", scale=scale, requires=REQUIRES, predicts=frozenset({"ess"}))
-    return Method(init, start, render_step, extrapolate_step, info)
+    return within_shots(Method(init, start, render_step, extrapolate_step, info))

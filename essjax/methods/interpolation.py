@@ -13,6 +13,7 @@ from essjax.cameras import pixel_positions
 from essjax.frames import Frame, Prediction, rendered_color, select_time
 from essjax.interfaces import Init, Method, MethodInfo, expand_flag, no_variables
 from essjax.methods.rendered import Memory, advance, push, reset_memory, start_memory
+from essjax.methods.shots import unlit
 from essjax.typing import Callable, Color, Flag, Jitter, Mask, Motion, Plane, PyTree, pytree
 from essjax.warp import backward_warp, inside_mask, jittered_motion, sample, splat_motion
 
@@ -78,7 +79,8 @@ def interpolator(name: str, between: Between, *, init: Init = no_variables) -> M
 
     It is built for the alternation: of several unrendered frames in a row all but the last repeat the rendered one. So
     does an unrendered frame before a cut, which has no later frame in its shot; one right after a cut, which has no
-    earlier frame, shows the next rendered one. ``aux`` of a rendered frame's step belongs to the frame before it.
+    earlier frame, shows the next rendered one, or ``shots.unlit`` where its shot has none. ``aux`` of a rendered
+    frame's step belongs to the frame before it.
 
     Args:
       name: as in ``--variant``.
@@ -90,10 +92,8 @@ def interpolator(name: str, between: Between, *, init: Init = no_variables) -> M
         return Seen(color=color, depth=frame.gbuffers.depth, motion=frame.motion)
 
     def start(example: Frame) -> History:
-        black = jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32)
-        return History(
-            rendered=start_memory(example, seen(example, black), 1), waiting=jnp.zeros(example.cut.shape, bool)
-        )
+        memory = start_memory(example, seen(example, unlit(example)), 1)
+        return History(rendered=memory, waiting=jnp.zeros(example.cut.shape, bool))
 
     def render_step(variables, history, frame, *, train=False):
         color = rendered_color(frame, name)
@@ -110,14 +110,15 @@ def interpolator(name: str, between: Between, *, init: Init = no_variables) -> M
         image, aux = between(variables, pair, train)
         repeat = expand_flag(~history.waiting | frame.cut, color.ndim)
         image = jnp.where(repeat, earlier.content.color, image)
-        image = jnp.where(expand_flag(before.count > 0, color.ndim), image, color)
+        image = jnp.where(expand_flag((before.count > 0) | frame.cut, color.ndim), image, color)
         memory = reset_memory(frame.cut, start(frame).rendered, memory)
         history = History(rendered=push(memory, frame, pair.later), waiting=jnp.zeros_like(history.waiting))
         return history, Prediction(image=image, aux=aux)
 
     def extrapolate_step(variables, history, frame, *, train=False):
         image = history.rendered.frames.content.color[0]
-        memory = advance(reset_memory(frame.cut, start(frame).rendered, history.rendered), frame)
+        nothing = frame.cut | (history.rendered.count == 0)
+        memory = advance(reset_memory(nothing, start(frame).rendered, history.rendered), frame)
         return History(rendered=memory, waiting=jnp.ones_like(history.waiting)), Prediction(image=image)
 
     info = MethodInfo(name, scale=1, latency=1, predicts=frozenset({"ess"}))

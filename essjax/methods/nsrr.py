@@ -15,10 +15,11 @@ from essjax.frames import Frame, Prediction, depth_scale, network_depth, rendere
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
 from essjax.methods.baselines import jau_image
 from essjax.methods.rendered import Memory, advance, push, reset_memory, start_memory
+from essjax.methods.shots import within_shots
 from essjax.networks.nsrr import FEATURES, PREVIOUS, RGBD
 from essjax.networks.nsrr import nsrr as nsrr_network
 from essjax.typing import Array, Image, pytree
-from essjax.warp import sample_zero_upsampled, upsample_motion, zero_upsample
+from essjax.warp import jitter_aligned_upsample, sample_zero_upsampled, upsample_motion, zero_upsample
 
 
 @pytree
@@ -38,12 +39,15 @@ def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
     """The previous frames' features at the output pixels of ``frame``, ``[4, ..., sH, sW, FEATURES]``.
 
     What zero-upsampling each and warping it by its motion (composed at low resolution, upsampled bilinearly) gives; 0
-    where a path leads outside and where no sample of that frame fell next to its end.
+    where a path leads outside or was reactive, and where no sample of that frame fell next to its end.
     """
     frames = rendered.frames
     motion = jax.lax.stop_gradient(upsample_motion(frames.motion, scale, jitter=frame.jitter))
     positions = pixel_positions(motion.shape[-3], motion.shape[-2]) + motion
-    return sample_zero_upsampled(frames.content, positions, scale, frames.jitter)
+    warped = sample_zero_upsampled(frames.content, positions, scale, frames.jitter)
+    if frames.trust is None:
+        return warped
+    return warped * jitter_aligned_upsample(frames.trust, scale, frame.jitter, mode="nearest")
 
 
 def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool = False) -> Method:
@@ -102,4 +106,6 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool =
         return history, Prediction(image=jnp.zeros((*lead, scale * height, scale * wide, 3), jnp.float32))
 
     info = MethodInfo("nsrr", scale=scale, predicts=frozenset({"ss"}), renders_all=not half)
-    return Method(init, start, render_step, pass_step if half else refuse_extrapolation("nsrr"), info)
+    if not half:
+        return Method(init, start, render_step, refuse_extrapolation("nsrr"), info)
+    return within_shots(Method(init, start, render_step, pass_step, info))

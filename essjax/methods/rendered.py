@@ -12,7 +12,7 @@ from essjax.color import demodulate, demodulation_albedo, modulate, reinhard, re
 from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
 from essjax.interfaces import expand_flag, reset_at_cut
 from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
-from essjax.warp import compose_motion, gbuffer_guided_warp, guides, jittered_motion
+from essjax.warp import backward_warp, compose_motion, gbuffer_guided_warp, guides, jittered_motion
 
 GUIDED = frozenset({"base_color", "normal"})
 """``MethodInfo.requires`` of every method that warps guided by G-buffers."""
@@ -27,12 +27,14 @@ class Rendered:
       jitter: ``[K, ..., 2]``.
       motion: ``[K, ..., H, W, 2]`` composed motion from the latest frame's samples to that frame, unjittered.
       valid: ``[K, ..., H, W, 1]``: 1 where that path stays on screen.
+      trust: ``[K, ..., H, W, 1]``: what the reactive masks along that path leave of it; None without such masks.
     """
 
     content: PyTree
     jitter: Jitter
     motion: Motion
     valid: Mask
+    trust: Mask | None
 
 
 @pytree
@@ -72,6 +74,7 @@ def _remember(frame: Frame, content: PyTree) -> Rendered:
         jitter=frame.jitter,
         motion=jnp.zeros_like(frame.motion),
         valid=jnp.ones_like(frame.gbuffers.depth),
+        trust=None if frame.reactive is None else jnp.ones_like(frame.reactive),
     )
 
 
@@ -87,7 +90,7 @@ def reset_memory(cut: Flag, fresh: Memory, memory: Memory) -> Memory:
 
 
 def advance(memory: Memory, frame: Frame) -> Memory:
-    """Extend all paths by the motion of ``frame``, so that they start at its samples."""
+    """Extend all paths by the motion of ``frame``, so that they start at its samples; its reactive mask is on them."""
     previous = memory.frames
 
     def share(leaf: Array) -> Array:
@@ -100,9 +103,12 @@ def advance(memory: Memory, frame: Frame) -> Memory:
         jitter_previous=share(memory.jitter),
         valid_previous=previous.valid,
     )
-    return dataclasses.replace(
-        memory, frames=dataclasses.replace(previous, motion=motion, valid=valid), jitter=frame.jitter
-    )
+    trust = previous.trust
+    if frame.reactive is not None and trust is not None:
+        lookup = jittered_motion(share(frame.motion), share(frame.jitter), share(memory.jitter))
+        trust = (1.0 - frame.reactive) * backward_warp(trust, lookup, mode="nearest")
+    frames = dataclasses.replace(previous, motion=motion, valid=valid, trust=trust)
+    return dataclasses.replace(memory, frames=frames, jitter=frame.jitter)
 
 
 def push(memory: Memory, frame: Frame, content: PyTree) -> Memory:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
+from essjax.methods.shots import upsampled_reactive, within_shots
 from essjax.typing import Array, PyTree
 from essjax.warp import (
     Resampled,
@@ -75,26 +76,32 @@ def _output_motion(frame: Frame, settings: Settings) -> Array:
     return upsample_motion(motion, settings.scale, jitter=frame.jitter)
 
 
-def _total_motion(history: PyTree, frame: Frame, settings: Settings) -> Array:
-    """Output-resolution motion from this frame to the image in the history, followed along the path."""
-    motion = _output_motion(frame, settings)
+def _path(history: PyTree, frame: Frame, settings: Settings) -> tuple[Array, Array | None]:
+    """From this frame to the image in the history, at output resolution: motion, and what masks leave of it."""
+    motion, reactive = _output_motion(frame, settings), upsampled_reactive(frame, settings.scale)
+    trust = None if reactive is None else 1.0 - reactive
     if "motion" not in history:  # every frame is rendered: the image is the previous frame's
-        return motion
-    earlier = jnp.where(expand_flag(frame.cut, motion.ndim), 0.0, history["motion"])
-    return motion + backward_warp(earlier, motion)
+        return motion, trust
+    if trust is not None:
+        trust = trust * backward_warp(history["trust"], motion, mode="nearest")
+    return motion + backward_warp(history["motion"], motion), trust
 
 
-def _reproject(history: PyTree, motion: Array, frame: Frame, settings: Settings) -> tuple[Array, Array]:
+def _reproject(
+    history: PyTree, motion: Array, trust: Array | None, frame: Frame, settings: Settings
+) -> tuple[Array, Array]:
     """The history's image at the current frame's pixels, and its count: 0 where there is none (off screen, cut)."""
     color = jnp.clip(backward_warp(history["color"], motion, mode=settings.history_mode), 0.0, 1.0)
     count = backward_warp(history["count"], motion) * inside_mask(motion)
+    count = count if trust is None else count * trust
     return color, jnp.where(expand_flag(frame.cut, count.ndim), 0.0, count)
 
 
 def _blend(count: Array, weight: Array, alpha: Array, settings: Settings) -> tuple[Array, Array]:
     """α β of eq 39, and the count that remains: the sum of the βs so far, which is N for a box."""
-    if settings.accumulation == "constant":
-        return alpha * weight, jnp.ones_like(count)
+    if settings.accumulation == "constant":  # its count is 1, less where history is not trusted in full
+        rate = alpha * weight
+        return rate + (1.0 - rate) * (1.0 - count), jnp.ones_like(count)
     total = count + weight
     if settings.accumulation == "bounded":  # α at least 1 / N: a new pixel converges as fast as an average does
         total = jnp.minimum(total, 1.0 / alpha)
@@ -110,7 +117,7 @@ def _render_step(settings: Settings, variables: PyTree, history: PyTree, frame: 
         current = tent_resample(color, bounded, frame.jitter, settings.scale)
     else:
         current = gaussian_resample(color, bounded, frame.jitter, variables["sigma"], settings.scale)
-    past, count = _reproject(history, _total_motion(history, frame, settings), frame, settings)
+    past, count = _reproject(history, *_path(history, frame, settings), frame, settings)
     rate, total = _blend(count, current.weight, variables["alpha"], settings)
     rate = jnp.where(count > 0, rate, 1.0)
     past = _rectify(past, current, settings)
@@ -120,13 +127,16 @@ def _render_step(settings: Settings, variables: PyTree, history: PyTree, frame: 
     new = {"color": image, "count": total}
     if "motion" in history:
         new["motion"] = jnp.zeros_like(history["motion"])
+    if "trust" in history:
+        new["trust"] = jnp.ones_like(history["trust"])
     return new, Prediction(image=reinhard_inverse(image), aux={"rate": rate})
 
 
 def _warp_step(settings: Settings, history: PyTree, frame: Frame) -> tuple[PyTree, Prediction]:
-    motion = _total_motion(history, frame, settings)
-    image, _ = _reproject(history, motion, frame, settings)
-    return {**history, "motion": motion}, Prediction(image=reinhard_inverse(image))
+    motion, trust = _path(history, frame, settings)
+    image, _ = _reproject(history, motion, trust, frame, settings)
+    history = {**history, "motion": motion} if trust is None else {**history, "motion": motion, "trust": trust}
+    return history, Prediction(image=reinhard_inverse(image))
 
 
 def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, half: bool, native: bool) -> Method:
@@ -146,7 +156,11 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
         *leading, height, width, _ = example.motion.shape
         size = (*leading, settings.scale * height, settings.scale * width)
         history = {"color": jnp.zeros((*size, 3), jnp.float32), "count": jnp.zeros((*size, 1), jnp.float32)}
-        return {**history, "motion": jnp.zeros((*size, 2), jnp.float32)} if half else history
+        if half:
+            history["motion"] = jnp.zeros((*size, 2), jnp.float32)
+            if example.reactive is not None:
+                history["trust"] = jnp.ones((*size, 1), jnp.float32)
+        return history
 
     def render_step(variables, history, frame, *, train=False):
         return _render_step(settings, variables, history, frame)
@@ -161,7 +175,9 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
         native=native,
         renders_all=not half,
     )
-    return Method(init, start, render_step, extrapolate_step if half else refuse_extrapolation(name), info)
+    if not half:
+        return Method(init, start, render_step, refuse_extrapolation(name), info)
+    return within_shots(Method(init, start, render_step, extrapolate_step, info))
 
 
 def taau(

@@ -87,7 +87,8 @@ def score_rollout(
         return {}
     now = np.asarray(scored)
     since_cut = _frames_since_cut(length, cuts)
-    alike = np.array([since_cut[n] >= PHASES and kinds[n] == kinds[n - PHASES] for n in scored])
+    made = has_source(kinds, np.zeros(length, bool) if cuts is None else cuts)
+    alike = np.array([since_cut[n] >= PHASES and kinds[n] == kinds[n - PHASES] and made[n - PHASES] for n in scored])
     consecutive = (since_cut[now] >= 1) & ("ess" not in kinds)
     # Where there is nothing to compare with: the frame itself, whose values are dropped below.
     before, like = np.where(consecutive, now - 1, now), np.where(alike, now - PHASES, now)
@@ -99,6 +100,21 @@ def score_rollout(
         values |= dict.fromkeys(() if alike[k] else SAME_PHASE) | dict.fromkeys(() if consecutive[k] else CONSECUTIVE)
         rows[n] = {"kind": kinds[n], **values, "non_finite": int(columns["non_finite"][k])}
     return rows
+
+
+def has_source(kinds: Sequence[str], cuts: Sequence[bool]) -> np.ndarray:
+    """Whether each frame has anything to be made of: it, or one before it in its shot, was rendered; bool ``[T]``.
+
+    Others show what a method falls back to (``methods.shots.unlit``), and say nothing about it.
+
+    Args:
+      kinds: "ss" or "ess" for each frame.
+      cuts: for each frame, whether a shot starts there; one does at frame 0.
+    """
+    rendered = np.asarray(kinds) == "ss"
+    number = np.arange(len(rendered))
+    latest = np.maximum.accumulate(np.where(rendered, number, -1))
+    return latest >= number - _frames_since_cut(len(rendered), cuts)
 
 
 def _frames_since_cut(length: int, cuts: Sequence[bool] | None) -> np.ndarray:

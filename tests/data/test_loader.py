@@ -1,4 +1,4 @@
-"""The loader: aligned, inside one shot, the same for the same seed, resumable."""
+"""The loader: aligned, cuts where they are, the same for the same seed, resumable."""
 
 import dataclasses
 import itertools
@@ -89,14 +89,13 @@ def test_without_flips_and_crop_clips_are_windows_of_the_source():
     assert not source[0].frames.cut[1:].any() and source[0].valid[3].any()  # the source is not touched
 
 
-def test_no_clip_crosses_a_cut():
-    """Cuts at 0 and 4 of 9 frames, length 3: starts 0, 1 and 4, 5, 6 (4 is a cut itself) by hand."""
+def test_cuts_stay_where_they_are():
+    """Cuts at 0 and 4 of 9 frames: every window of three is a clip, which also begins with a cut."""
     source = [coordinates(0, cuts=(0, 4))]
-    assert windows(source, 3) == [(0, 0), (0, 1), (0, 4), (0, 5), (0, 6)]
-    seen = set()
-    for clip in take(clips(source, length=3, batch=1, flips=False), 10):
-        seen.add(int(clip.frames.color[0, 0, 0, 0, 2]))
-    assert seen == {0, 1, 4, 5, 6}
+    assert windows(source, 3) == [(0, start) for start in range(7)]
+    for clip in take(clips(source, length=3, batch=1, flips=False, epochs=1), 7):
+        start = int(clip.frames.color[0, 0, 0, 0, 2])
+        np.testing.assert_array_equal(clip.frames.cut[:, 0], [True, start == 3, start == 2])
 
 
 def test_every_epoch_shows_every_window_once_in_another_order():
@@ -193,7 +192,7 @@ def test_a_window_is_a_slice_of_the_whole(on_disk, memory):
 def test_batches_from_disk_are_those_of_sequences_in_memory(on_disk, frames, size):
     memory = None if frames is None else frames * frame_bytes(on_disk)
     settings = {"length": 3, "batch": 2, "crop": size, "seed": 3}
-    expected = take(clips(in_memory(on_disk), **settings), 20)  # more than two epochs of 7 + 7 + 3 windows
+    expected = take(clips(in_memory(on_disk), **settings), 22)  # more than two epochs of 7 + 7 + 5 windows
     disk = lambda: iter(clips(disk_source(on_disk, "train", memory=memory), **settings))
     iterator = disk()
     for batch in expected[:12]:
@@ -211,7 +210,7 @@ def test_a_clip_reads_its_own_frames_and_each_frame_once(on_disk, reads):
     source.window(1, 4, 3)
     source.window(1, 5, 3)
     assert sorted(reads) == [("s1", 4), ("s1", 5), ("s1", 6), ("s1", 7)]
-    assert len(list(batches)) == 7 + 7 + 3  # the third has frames 2 to 8 with a cut at 5: starts 2, 5 and 6
+    assert len(list(batches)) == 7 + 7 + 5  # the third has frames 2 to 8
     assert len(set(reads)) == len(reads) == 9 + 9 + 7
 
 
@@ -267,8 +266,8 @@ def test_a_cached_source_makes_each_sequence_once():
 
 def test_errors():
     source = [coordinates(0, cuts=(0, 4))]
-    with pytest.raises(ValueError, match="no 6 consecutive frames without a cut in 1 sequences .the longest has 9"):
-        clips(source, length=6, batch=1)
+    with pytest.raises(ValueError, match="no 10 frames in a row in 1 sequences .the longest has 9"):
+        clips(source, length=10, batch=1)
     with pytest.raises(ValueError, match="a crop of 13x4 does not fit into sequence 0 of 12x8"):
         clips(source, length=2, batch=1, crop=(4, 13))
     with pytest.raises(ValueError, match=r"expected length >= 1 and batch >= 1, got 2 and 0"):

@@ -59,7 +59,7 @@ def test_latency_is_found_in_the_program(reads):
 
     def render_step(variables, history, frame, *, train=False):
         new, prediction = base.render_step(variables, history, frame)
-        image = history["color"] + (prediction.image if reads else 0.0)
+        image = history.inner["color"] + (prediction.image if reads else 0.0)
         return new, prediction.__class__(image=image)
 
     late = base._replace(
@@ -70,7 +70,7 @@ def test_latency_is_found_in_the_program(reads):
     def render(history):
         from essjax.frames import Prediction
 
-        return Prediction(image=history["color"])
+        return Prediction(image=history.inner["color"])
 
     assert method_cost(late, 16, 12).latency == int(reads)
 

@@ -100,7 +100,7 @@ def test_equal_pictures_score_alike_whatever_the_schedule(tmp_path):
     dark = half._replace(
         extrapolate_step=lambda variables, history, frame, *, train=False: (
             history,
-            Prediction(image=0 * history["image"]),
+            Prediction(image=0 * history.inner["image"]),
         )
     )
     found = evaluate({name: Runner(m, {}) for name, m in (("whole", whole), ("half", half), ("dark", dark))}, clips)
@@ -109,6 +109,17 @@ def test_equal_pictures_score_alike_whatever_the_schedule(tmp_path):
     for name in ("psnr", "tpsnr", "warped_error", "warped_error_reference", "psnr_foreground"):
         assert rows[0][name] == rows[1][name] == rows[2][name]
     assert rows[0]["temporal_error"] is not None and rows[1]["temporal_error"] is None
+
+
+def test_an_estimated_mask_has_no_history_at_a_cut():
+    frames = jax.tree.map(lambda leaf: leaf[:, 0], make_sequence(2, 3, 1, 12, 16).frames)
+    still = dataclasses.replace(frames, gbuffers=jax.tree.map(lambda leaf: leaf.at[2].set(leaf[1]), frames.gbuffers))
+    still = dataclasses.replace(still, motion=0 * still.motion, jitter=0 * still.jitter)
+    shares = [
+        float(module.estimated_valid(dataclasses.replace(still, cut=still.cut.at[2].set(cut)))[2].mean())
+        for cut in (False, True)
+    ]
+    assert shares == [1.0, 0.0]
 
 
 def test_native_frames_are_read_on_request(dataset):

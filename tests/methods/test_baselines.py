@@ -187,8 +187,8 @@ def test_warp_follows_integer_motion_and_jitter():
         np.testing.assert_allclose(prediction.image[: -t - 1, 2 * t :], expected[: -t - 1, 2 * t :], atol=1e-5)
     history, _ = render({}, history, select_time(frames, 3))  # two in a row: the latest counts
     history, _ = render({}, history, select_time(frames, 4))
-    np.testing.assert_array_equal(history["color"], frames.color[4])
-    np.testing.assert_array_equal(history["motion"], 0.0)
+    np.testing.assert_array_equal(history.inner["color"], frames.color[4])
+    np.testing.assert_array_equal(history.inner["motion"], 0.0)
 
 
 def test_warp_adds_the_jitter_difference():

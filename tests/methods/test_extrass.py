@@ -272,7 +272,7 @@ def test_history_beside_a_lamp_does_not_ring():
     height, width = frame.motion.shape[-3:-1]
     frame = dataclasses.replace(frame, motion=jnp.full_like(frame.motion, 0.25), cut=jnp.zeros_like(frame.cut))
     image = jnp.ones((frame.motion.shape[0], 2 * height, 2 * width, 3)).at[:, 9, 11].set(1000.0)
-    history = dataclasses.replace(extrass(width=8).start(frame), image=image)
+    history = dataclasses.replace(extrass(width=8).start(frame).inner, image=image)
     warped = jax.jit(functools.partial(warp_history, scale=2))(history, frame).log_image
     assert float(jnp.expm1(warped).min()) > 0.7
     assert float(jnp.expm1(warped[:, 9, 11]).max()) < 1000
@@ -286,9 +286,7 @@ def test_trust_is_soft_beside_a_hole():
         still.gbuffers, depth=jnp.full_like(still.gbuffers.depth, 10.0)))  # fmt: skip
     before = dataclasses.replace(still, gbuffers=dataclasses.replace(
         still.gbuffers, depth=still.gbuffers.depth.at[:, 5, 6].set(2.0)))  # fmt: skip
-    method = extrass(width=8)
-    history = dataclasses.replace(method.start(before), empty=jnp.zeros_like(frame.cut))
-    valid = warp_history(history, still, 2).valid_low[0, ..., 0]
+    valid = warp_history(extrass(width=8).start(before).inner, still, 2).valid_low[0, ..., 0]
     expected = np.ones(valid.shape)
     expected[4:7, 5:8] = 8 / 9
     np.testing.assert_allclose(valid, expected, rtol=1e-5)

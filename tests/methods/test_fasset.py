@@ -205,7 +205,7 @@ def after_first(busy, frames):
 
 
 def hidden_state(history):
-    return history.rendered.frames.content.hidden[0]
+    return history.inner.rendered.frames.content.hidden[0]
 
 
 def copy(history):
@@ -237,10 +237,10 @@ def test_only_rendered_frames_update_the_hidden_state(busy):
     extrapolated, image = streaming()[ESS](busy, copy(history), select_time(frames, 1))
     np.testing.assert_array_equal(hidden_state(extrapolated), before)
     emptied = copy(history)
-    frames_kept = emptied.rendered.frames
+    frames_kept = emptied.inner.rendered.frames
     content = dataclasses.replace(frames_kept.content, hidden=jnp.zeros_like(frames_kept.content.hidden))
-    kept = dataclasses.replace(emptied.rendered, frames=dataclasses.replace(frames_kept, content=content))
-    emptied = dataclasses.replace(emptied, rendered=kept)
+    kept = dataclasses.replace(emptied.inner.rendered, frames=dataclasses.replace(frames_kept, content=content))
+    emptied = dataclasses.replace(emptied, inner=dataclasses.replace(emptied.inner, rendered=kept))
     _, other = streaming()[ESS](busy, emptied, select_time(frames, 1))
     assert float(jnp.abs(image - other).max()) > 1e-4  # but it is read
 

@@ -113,8 +113,8 @@ def test_extranet_warps_what_nsrr_made(halved):
 def test_extranet_plus_sees_samples_and_holes_between_them():
     frames = make_frames(4, T=2, B=B, H=H, W=W)
     first, second = (select_time(frames, n) for n in range(2))
-    # Two walls; the far one shows on the right.
-    depth = jnp.broadcast_to(jnp.where(jnp.arange(W) < 9, 5.0, 9.0)[:, None], first.gbuffers.depth.shape)
+    # Two walls; the near one on the right was before the far one.
+    depth = jnp.broadcast_to(jnp.where(jnp.arange(W) < 9, 9.0, 5.0)[:, None], first.gbuffers.depth.shape)
     nothing = dict.fromkeys(("stencil", "world_position", "n_dot_v"))
     flat = jnp.zeros_like(first.color).at[..., 2].set(1.0)
     gbuffers = dataclasses.replace(first.gbuffers, depth=depth, normal=flat, **nothing)

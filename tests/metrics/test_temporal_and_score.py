@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from essjax.metrics import METRICS, aggregate, flicker, score_rollout, spatio_temporal_error, tpsnr, warped_error
+from essjax.metrics import (
+    METRICS,
+    aggregate,
+    flicker,
+    has_source,
+    score_rollout,
+    spatio_temporal_error,
+    tpsnr,
+    warped_error,
+)
 from tests.helpers import random_image
 
 T, H, W = 5, 13, 18
@@ -111,6 +120,25 @@ def test_temporal_metrics_are_those_of_equal_phases(rollout):
     cut = score_rollout(**rollout, scored=[2, 3, 4], kinds=EVERY, cuts=[True, False, True, False, False])
     assert values(cut, 2) == values(cut, 3) == [None] * 3 and values(cut, 4) == values(one, 4)
     assert cut[2]["temporal_error"] is None and cut[3]["temporal_error"] == one[3]["temporal_error"]
+
+
+def test_what_was_made_of_nothing_is_no_predecessor(rollout):
+    """Frame 2 is a cut that is not rendered, so frame 4 has nothing of its kind to be compared with."""
+    kinds, cuts = ("ss", "ss", "ess", "ss", "ess"), [True, False, True, False, False]
+    np.testing.assert_array_equal(has_source(kinds, cuts), [True, True, False, True, True])
+    assert score_rollout(**rollout, scored=[4], kinds=kinds, cuts=cuts)[4]["tpsnr"] is None
+    assert score_rollout(**rollout, scored=[4], kinds=kinds)[4]["tpsnr"] is not None
+
+
+def test_what_frames_are_made_of():
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        kinds, cuts = random.choice(["ss", "ess"], 15), random.random(15) < 0.2
+        expected, found = [], False
+        for kind, cut in zip(kinds, cuts, strict=True):
+            found = bool(kind == "ss" or (found and not cut))
+            expected.append(found)
+        np.testing.assert_array_equal(has_source(kinds, cuts), expected)
 
 
 def test_warped_error_follows_both_motions():

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 
 from essjax.frames import Frame, Prediction, Sequence, select_time, without_color
 from essjax.interfaces import Method, Step
+from essjax.losses import masked_mean
 from essjax.rollout import ESS, SS, Schedule, alternate, unroll
-from essjax.typing import Array, Callable, PyTree
+from essjax.typing import Array, Callable, Image, PyTree
 
 Objective = Callable[[PyTree, Sequence], tuple[dict[str, Array], PyTree]]
 """``(variables, clip) -> (weighted terms, new BatchNorm statistics by entry)``; the loss is the sum of the terms."""
@@ -25,6 +26,9 @@ def _begun(clip: Sequence) -> Sequence:
 def since_cut(cut: Array) -> Array:
     """How many frames ago the last cut was, int32 ``[T, ...]``: 0 at a cut, far more than T before the first one.
 
+    In the alternation a frame that is not rendered has one rendered frame to be made of from 1 on, two from 3 on; at 0
+    it has none, and is no target.
+
     Args:
       cut: bool ``[T, ...]``.
     """
@@ -33,6 +37,11 @@ def since_cut(cut: Array) -> Array:
 
 
 _LONG_AGO = 1 << 20
+
+
+def frame_mean(values: Image, weight: Array) -> Array:
+    """Mean over frames ``[..., H, W, C]`` that count ``weight`` ``[...]`` each; 0 where none counts."""
+    return masked_mean(jnp.mean(values, axis=(-3, -2, -1)), weight)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +123,8 @@ def both_kinds(
 ) -> tuple[dict[str, PyTree], PyTree]:
     """Unroll ``clip`` twice, the second time from frame 1, side by side in one scan; both alternate SS, ESS, SS, ...
 
-    Where one run renders the other extrapolates, so frames 1 ... T-2 are predicted as both kinds.
+    Where one run renders the other extrapolates, so frames 1 ... T-2 are predicted as both kinds. As ESS, those that
+    are cuts are made of nothing: see ``since_cut``.
 
     Returns:
       kind -> ``keep(aux)`` of frames 1 ... T-2, time-major; and the new statistics, see ``Rollout.state``.

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from essjax.color import reinhard
 from essjax.frames import Sequence, select_time
-from essjax.interfaces import Method
+from essjax.interfaces import Method, expand_flag
 from essjax.losses import spatio_temporal
 from essjax.rollout import SS, every, unroll
 from essjax.train.objectives.common import Objective
@@ -22,7 +22,7 @@ def dlctus_objective(method: Method, *, targets: int = 5, theta: float | None = 
       method: ``dlctus``.
       targets: number of frames with a loss; all but the first of a shorter clip (that one is the JAU frame).
       theta: share of the temporal term, in [0, 1]; None: plain L1. The previous frame's error is brought here with the
-        motion, bilinearly; what that gets wrong stays in, as in the thesis.
+        motion, bilinearly; what that gets wrong stays in, as in the thesis. A cut has plain L1: nothing is before it.
     """
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
@@ -36,7 +36,8 @@ def dlctus_objective(method: Method, *, targets: int = 5, theta: float | None = 
             return {"l1": jnp.mean(jnp.abs(error[1:]))}, rollout.state
         frames = select_time(clip.frames, last)
         motion = upsample_motion(frames.motion, clip.scale, jitter=frames.jitter)
-        loss = spatio_temporal(error[1:], backward_warp(error[:-1], motion), theta=theta)
+        before = jnp.where(expand_flag(frames.cut, error.ndim), 0.0, backward_warp(error[:-1], motion))
+        loss = spatio_temporal(error[1:], before, theta=theta)
         return {"spatio_temporal": jnp.mean(loss)}, rollout.state
 
     return objective

@@ -4,8 +4,6 @@ Our reading, that of the published code: the losses compare the network's output
 log(1 + x), before base colour comes back. The frame is the jittered, aliased one.
 """
 
-import jax.numpy as jnp
-
 from essjax.color import demodulate, log1p
 from essjax.frames import Sequence, rendered_color, select_time
 from essjax.interfaces import Method
@@ -13,7 +11,7 @@ from essjax.losses import hardest, l1, masked_mean, occlusion
 from essjax.methods.extranet import WINDOW
 from essjax.methods.fasset_baselines import enlarge
 from essjax.methods.rendered import albedo
-from essjax.train.objectives.common import Objective, predict_last
+from essjax.train.objectives.common import Objective, predict_last, since_cut
 from essjax.typing import Array, Callable, Color, PyTree
 
 
@@ -38,6 +36,7 @@ def extranet_objective(
     """L of ExtraNet eq 7, on the last frame of each clip: L1 (eq 4), holes (eq 5), the worst pixels (eq 6).
 
     A clip of ``WINDOW`` frames shows the network three rendered ones; of a longer one only the last frames are used.
+    Where the last one is a cut, there is nothing to learn.
 
     Args:
       method: ``extranet``.
@@ -53,13 +52,14 @@ def extranet_objective(
         prediction = predict_last(method, variables, frames)
         image = prediction.aux["log_shading"]
         target = log1p(target_shading(select_time(clip, -1)))
-        errors, hole = l1(image, target), 1.0 - prediction.aux["inputs"].mask
+        counts = (since_cut(clip.frames.cut)[-1] > 0)[..., None, None, None]
+        errors, hole = l1(image, target), (1.0 - prediction.aux["inputs"].mask) * counts
         terms = {
-            "l1": jnp.mean(errors),
+            "l1": masked_mean(errors, counts),
             "hole": hole_weight * masked_mean(occlusion(image, target, hole), hole),
         }
         if shade_weight:
-            terms["shade"] = shade_weight * masked_mean(errors, hardest(errors, share=share))
+            terms["shade"] = shade_weight * masked_mean(errors, hardest(errors, share=share) * counts)
         return terms, prediction.state
 
     return objective

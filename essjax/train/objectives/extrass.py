@@ -20,7 +20,6 @@ from essjax.losses import (
     masked_mean,
     occlusion,
     perceptual,
-    sum_of_means,
     temporal_l1,
 )
 from essjax.methods.extrass_low import halve
@@ -31,21 +30,22 @@ from essjax.train.objectives.common import (
     Recurrent,
     both_kinds,
     follow_both_kinds,
+    frame_mean,
     odd_length,
     since_cut,
     start_both_kinds,
 )
-from essjax.typing import Array, Callable, Image, PyTree
+from essjax.typing import Array, Callable, PyTree
 
 WITH_TWO_PICTURES = 3
-"""The first frame of a clip that each run extrapolates from two rendered frames: at 1 and 2 both are the same one."""
+"""The first frame of a shot that each run extrapolates from two rendered frames: at 1 and 2 both are the same one."""
 
 
 def frnet_objective(method: Method, network: Network, *, feature_weight: float = 0.001) -> Objective:
     """L_FR of ExtraSS eq 7-9: Charbonnier + census on the half-size output, census on features.
 
-    From frame 3 on: before, the two rendered frames that FRNet compares are one and the same. Of three frames, where
-    only frame 1 is extrapolated, that one.
+    From the fourth frame of a shot on: before, the two rendered frames that FRNet compares are one and the same. Of
+    three frames, where only frame 1 is extrapolated, that one.
 
     Args:
       method: ``extrass_e``.
@@ -59,14 +59,15 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
         length = clip.frames.motion.shape[0]
         first = WITH_TWO_PICTURES if length > WITH_TWO_PICTURES + 1 else 1
         predicted = jax.tree.map(lambda leaf: leaf[first - 1 :], kinds[ESS])  # kinds begin at frame 1
+        counts = since_cut(clip.frames.cut)[first:-1] >= first
         target = log1p(halve(rendered_color(clip.frames, "frnet")[first:-1]))
         # The target's features are given: learned from this side too, they shrink until nothing differs.
         features, _ = network.apply(jax.lax.stop_gradient(variables["frnet"]), target, method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted.features, features, strict=True)]
         terms = {
-            "charbonnier": jnp.mean(charbonnier(predicted.half, target)),
-            "census": jnp.mean(census(predicted.half, target)),
-            "feature_census": feature_weight * sum_of_means(distances),
+            "charbonnier": frame_mean(charbonnier(predicted.half, target), counts),
+            "census": frame_mean(census(predicted.half, target), counts),
+            "feature_census": feature_weight * sum(frame_mean(distance, counts) for distance in distances),
         }
         return terms, state
 
@@ -87,7 +88,8 @@ def extrass_objective(
 ) -> Recurrent:
     """L of ExtraSS eq 11-14 over both kinds of every inner frame of a clip; features: where both encoders see history.
 
-    Frame n after a cut has the weight (n + 1) / 8, at most 1.
+    Frame n after a cut has the weight (n + 1) / 8, at most 1. A cut itself is no ESS target, for it is made of nothing,
+    and has no holes.
 
     Args:
       method: ``extrass``.
@@ -112,24 +114,20 @@ def extrass_objective(
         for kind, predicted in kinds.items():
             image, warped = predicted["log_image"], predicted["warped"]
             valid = warped.valid if clip.valid is None else nearest_upsample(clip.valid[1:-1], clip.scale)
-            hole = 1 - valid
-            terms[f"l1_{kind}"] = _mean(l1(image, target), weight)
+            hole = (1 - valid) * (since > 0)[..., None, None, None]
+            counts = jnp.where(since > 0, weight, 0.0) if kind == ESS else weight
+            terms[f"l1_{kind}"] = frame_mean(l1(image, target), counts)
             terms[f"occlusion_{kind}"] = occlusion_weight * masked_mean(occlusion(image, target, hole), pixels * hole)
             change = temporal_l1(image, warped.log_image, warped.valid)
             terms[f"temporal_{kind}"] = temporal_weight * masked_mean(change, pixels * warped.valid)
             if vgg_features is not None:
                 levels = perceptual(expm1(image), expm1(target), vgg_features)
-                terms[f"vgg_{kind}"] = vgg_weight * sum(_mean(level, weight) for level in levels)
+                terms[f"vgg_{kind}"] = vgg_weight * sum(frame_mean(level, counts) for level in levels)
         # Without the frame after a cut: as SS it starts a run, so E0 sees no history there, and E1 does.
         weight = jnp.where(since > 1, weight, 0.0)
         # E1 follows E0: drawn to each other, both shrink to zero (experiments/LOG.md).
         levels = feature_l1(jax.lax.stop_gradient(kinds[SS]["features"]), kinds[ESS]["features"])
-        terms["features"] = temporal_weight * sum(_mean(level, weight) for level in levels)
+        terms["features"] = temporal_weight * sum(frame_mean(level, weight) for level in levels)
         return terms, state, history
 
     return Recurrent(start, follow)
-
-
-def _mean(values: Image, weight: Array) -> Array:
-    """Mean over frames ``[T, B, H, W, C]`` that count ``weight`` ``[T, B]`` each; 0 where none counts."""
-    return masked_mean(jnp.mean(values, axis=(-3, -2, -1)), weight)

@@ -1,19 +1,18 @@
 """What IFRNet minimises (Kong et al. 2022): reconstruction and feature space geometry, on log(1 + x)."""
 
 import jax
-import jax.numpy as jnp
 
 from essjax.color import log1p
 from essjax.frames import Sequence, rendered_color, select_time
 from essjax.interfaces import Method, Network
-from essjax.losses import census, charbonnier, feature_census, sum_of_means
+from essjax.losses import census, charbonnier, feature_census
 from essjax.rollout import alternate
-from essjax.train.objectives.common import Objective, predict_last
+from essjax.train.objectives.common import Objective, frame_mean, predict_last, since_cut
 from essjax.typing import Array, PyTree
 
 
 def ifrnet_objective(method: Method, network: Network, *, feature_weight: float = 0.01) -> Objective:
-    """Charbonnier, census and feature geometry of the middle one of a clip's last three frames.
+    """Charbonnier, census and feature geometry of the middle one of a clip's last three frames, if no cut is between.
 
     Args:
       method: ``ifrnet``.
@@ -26,6 +25,7 @@ def ifrnet_objective(method: Method, network: Network, *, feature_weight: float 
         if length < 3:
             raise ValueError(f"clip: expected at least 3 frames (two rendered ones around a third), got {length}.")
         frames = select_time(clip.frames, slice(-3, None))
+        counts = since_cut(clip.frames.cut)[-1] >= 2
         prediction = predict_last(method, variables, frames, alternate(0))
         predicted = prediction.aux
         target = log1p(rendered_color(frames, "ifrnet")[1])
@@ -34,9 +34,9 @@ def ifrnet_objective(method: Method, network: Network, *, feature_weight: float 
         features, _ = network.apply(given, target - predicted["mean"], method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted["features"], features, strict=False)]
         terms = {
-            "charbonnier": jnp.mean(charbonnier(predicted["image"], target)),
-            "census": jnp.mean(census(predicted["image"], target)),
-            "feature_census": feature_weight * sum_of_means(distances),
+            "charbonnier": frame_mean(charbonnier(predicted["image"], target), counts),
+            "census": frame_mean(census(predicted["image"], target), counts),
+            "feature_census": feature_weight * sum(frame_mean(distance, counts) for distance in distances),
         }
         return terms, prediction.state
 

@@ -1,0 +1,107 @@
+"""What a frame may take from those before it: nothing across a cut, and nothing where it is reactive.
+
+A shot begins with its first *rendered* frame. What comes before that shows ``unlit`` and is not remembered.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from essjax.frames import Frame
+from essjax.interfaces import Method, expand_flag
+from essjax.typing import Color, Flag, Image, Mask, PyTree, pytree
+from essjax.warp import jitter_aligned_upsample
+
+
+@pytree
+class Shot:
+    """The history of a method behind ``within_shots``.
+
+    Attributes:
+      inner: the method's own.
+      empty: bool ``[...]``: nothing was rendered since the last cut.
+    """
+
+    inner: PyTree
+    empty: Flag
+
+
+def unlit(frame: Frame, scale: float = 1) -> Color:
+    """What a frame shows while nothing was rendered in its shot: its base colour as if lit evenly, else black.
+
+    Base colour over exposure, which is the radiance that is displayed as the base colour.
+
+    Args:
+      frame: its colour is not read.
+      scale: output size over input size; at 1 the picture lies at the frame's own samples.
+
+    Returns:
+      ``[..., round(scale * H), round(scale * W), 3]``.
+    """
+    base = frame.gbuffers.base_color
+    if base is None:
+        *lead, height, width, _ = frame.motion.shape
+        return jnp.zeros((*lead, round(scale * height), round(scale * width), 3), jnp.float32)
+    radiance = base / expand_flag(frame.exposure, base.ndim)
+    return radiance if scale == 1 else jitter_aligned_upsample(radiance, scale, frame.jitter)
+
+
+def upsampled_reactive(frame: Frame, scale: int) -> Mask | None:
+    """The frame's reactive mask at the output's pixels, each as the nearest sample; None without one."""
+    if frame.reactive is None:
+        return None
+    return jitter_aligned_upsample(frame.reactive, scale, frame.jitter, mode="nearest")
+
+
+def without_history(history: Image, current: Image, frame: Frame, scale: int) -> Image:
+    """``history``, but ``current`` as far as the frame is reactive, and everywhere where it begins a shot.
+
+    Args:
+      history: what was shown, at the output pixels of ``frame``, ``[..., sH, sW, C]``.
+      current: what the frame's own samples show there.
+      frame: its mask and whether it is a cut.
+      scale: output size over input size.
+    """
+    reactive = upsampled_reactive(frame, scale)
+    if reactive is not None:
+        mixed = (1.0 - reactive) * history + reactive * current
+        history = jnp.where(reactive < 1.0, mixed, current)  # at 1 nothing is left, not even NaN
+    return jnp.where(expand_flag(frame.cut, current.ndim), current, history)
+
+
+def continued(frame: Frame, empty: Flag) -> Frame:
+    """``frame`` as one that begins its shot where nothing was rendered yet in it (``empty``)."""
+    return dataclasses.replace(frame, cut=frame.cut | empty)
+
+
+def within_shots(method: Method) -> Method:
+    """``method``, whose shots begin with their first rendered frame.
+
+    A frame that is not rendered and has no rendered one before it in its shot shows ``unlit``, and the frame after it
+    is a cut for ``method``, which so neither trusts that picture nor remembers anything from before the shot.
+
+    Args:
+      method: without latency; its own steps forget everything where ``frame.cut``.
+
+    Raises:
+      ValueError: the method lags: its step's image is not that of the step's frame.
+    """
+    if method.info.latency:
+        raise ValueError(f"within_shots: expected a method without latency, got {method.info.name}.")
+
+    def start(example: Frame) -> Shot:
+        return Shot(inner=method.start(example), empty=jnp.ones(example.cut.shape, bool))
+
+    def render_step(variables, history, frame, *, train=False):
+        seen = continued(frame, history.empty)
+        inner, prediction = method.render_step(variables, history.inner, seen, train=train)
+        return Shot(inner=inner, empty=jnp.zeros_like(history.empty)), prediction
+
+    def extrapolate_step(variables, history, frame, *, train=False):
+        seen = continued(frame, history.empty)
+        inner, prediction = method.extrapolate_step(variables, history.inner, seen, train=train)
+        fallback = unlit(frame, method.info.scale)
+        image = jnp.where(expand_flag(seen.cut, fallback.ndim), fallback, prediction.image)
+        return Shot(inner=inner, empty=seen.cut), dataclasses.replace(prediction, image=image)
+
+    return method._replace(start=start, render_step=render_step, extrapolate_step=extrapolate_step)
