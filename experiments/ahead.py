@@ -53,16 +53,16 @@ class _Awaited:
         return self._step.result()
 
 
-def state_shapes(stages: list[Stage], stage: Stage, batch: Sequence) -> TrainState:
+def state_shapes(stages: list[Stage], stage: Stage, config: Config, batch: Sequence) -> TrainState:
     """The state that ``train_stages`` starts ``stage`` with, as ``jax.ShapeDtypeStruct``s."""
 
     def make(key: Array, batch: Sequence) -> TrainState:
         variables = stages[-1].method.init(key, select_time(batch.frames, 0))
-        return initial_state(stages, stage, variables, batch)
+        return initial_state(stages, stage, config, variables, batch)
 
     return jax.eval_shape(make, jax.random.key(0), batch)
 
 
 def _compile(stages: list[Stage], stage: Stage, config: Config):
     batch = batch_shapes(config, stage)
-    return make_step(stage, config).lower(state_shapes(stages, stage, batch), batch, 0.0).compile()
+    return make_step(stage, config).lower(state_shapes(stages, stage, config, batch), batch, 0.0).compile()

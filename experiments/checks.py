@@ -56,7 +56,7 @@ def check_scored(dataset: Dataset, config: Config) -> None:
     """Refuse data with sequences of which no frame is scored, before anything is trained.
 
     Raises:
-      ValueError: a test sequence, or a validation sequence where methods are tuned on them, is all warm-up.
+      ValueError: a test sequence, or a validation sequence where they are used, is all warm-up.
     """
     for split in scored_splits(config):
         empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, config)]
@@ -65,7 +65,7 @@ def check_scored(dataset: Dataset, config: Config) -> None:
 
 def scored_splits(config: Config) -> tuple[str, ...]:
     """Splits whose frames are scored in a run."""
-    return ("validation", "test") if config.tune else ("test",)
+    return ("validation", "test") if config.tune or config.validations else ("test",)
 
 
 def _has_scored(dataset: Dataset, segment: Segment, config: Config) -> bool:

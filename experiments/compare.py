@@ -42,7 +42,7 @@ def _compare(options: argparse.Namespace, console: Console) -> int:
     out = Path(options.out) if options.out else default_folder("compare", options.preset, options.data)
     metrics = compare(
         names, preset=options.preset, overrides=options.overrides, data=options.data, out=out, resume=options.resume,
-        eval_only=options.eval_only, console=console,
+        eval_only=options.eval_only, console=console, tensorboard=options.tensorboard,
     )  # fmt: skip
     return exit_code(metrics, console)
 
@@ -57,6 +57,7 @@ def compare(
     resume: bool,
     eval_only: bool,
     console: Console,
+    tensorboard: bool = False,
 ) -> dict:
     """Train and evaluate ``names`` on the same data; returns the content of ``out / "metrics.json"``.
 
@@ -75,7 +76,7 @@ def compare(
     check_folder(out, wanted, resume=resume, eval_only=eval_only)
     return run_experiment(
         names, configs, folders, preset=preset, overrides=overrides, data=data, out=out, wanted=wanted,
-        eval_only=eval_only, console=console,
+        eval_only=eval_only, console=console, tensorboard=tensorboard,
     )  # fmt: skip
 
 

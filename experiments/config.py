@@ -19,7 +19,9 @@ class Config:
       learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (false:
       no stage's learning rate decays), fresh (new train scenes after so many steps, rendered in the meantime;
       None: always those on disk), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
-      of VGG-16 weights).
+      of VGG-16 weights); average (decay of a moving average of the weights over the steps; None: the last weights) and
+      validations (how often in each stage, equally apart in its budget, the averaged weights play a few frames of each
+      validation clip: the best are kept; None: never, the last are).
     Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
       scored at the start and after a cut), pictures (chosen frames per sequence).
     optimize: false compiles in half the time for slower code.
@@ -57,6 +59,8 @@ class Config:
     vgg_weight: float = 0.01
     temporal_weight: float = 0.1
     vgg: str | None = None
+    average: float | None = 0.99
+    validations: int | None = 10
     tune: bool = True
     warmup: int = 5
     pictures: int = 1
@@ -72,14 +76,15 @@ PRESETS: dict[str, Config] = {
     "smoke": Config(
         size=(48, 28), train_sequences=1, train_frames=7, test_frames=8, train_spp=4, test_spp=8, clip=3, crop=(32, 24),
         batch=2, first_batch=2, width=8, first_width=8, first_steps=4, steps=6, first_seconds=None, seconds=None,
-        warmup=2, tune=False, optimize=False,
+        validations=2, warmup=2, tune=False, optimize=False,
     ),
     "quick": Config(),
     "paper": Config(
         size=(960, 540), train_sequences=20, validation_sequences=2, test_sequences=2, train_frames=60, test_frames=60,
         train_spp=64, test_spp=64, clip=9, crop=(128, 128), batch=12, first_batch=8, width=24, first_width=24,
         first_learning_rate=1e-4, learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0,
-        first_steps=100 * 900, steps=120 * 600, first_seconds=None, seconds=None, save_every=300.0, pictures=2,
+        first_steps=100 * 900, steps=120 * 600, first_seconds=None, seconds=None, save_every=300.0, average=0.999,
+        validations=100, pictures=2,
     ),
 }  # fmt: skip
 """smoke: every part runs once, two minutes on two cores. quick: the default, seven minutes. paper: the
@@ -152,6 +157,8 @@ def _check(config: Config) -> None:
         value = getattr(config, name)
         if value is not None and not 0 < value < math.inf:
             raise ValueError(f"--set {name}: expected a number above 0, got {value}.")
+    if config.average is not None and not 0 <= config.average < 1:
+        raise ValueError(f"--set average: expected a decay in [0, 1), got {config.average}.")
     if not math.isfinite(config.mip_bias):
         raise ValueError(f"--set mip_bias: expected a finite number, got {config.mip_bias}.")
 
@@ -163,7 +170,7 @@ _LEAST = {
     "batch": (1, ""), "first_width": (1, " channel"), "width": (1, " channel"), "first_steps": (1, " step"),
     "steps": (1, " step"), "fresh": (1, " step on each round of scenes"), "save_every": (0, " seconds"),
     "feature_weight": (0, ""), "occlusion_weight": (0, ""), "vgg_weight": (0, ""), "temporal_weight": (0, ""),
-    "warmup": (0, " frames"), "pictures": (0, ""),
+    "validations": (1, " validation"), "warmup": (0, " frames"), "pictures": (0, ""),
 }  # fmt: skip
 """The smallest value of a setting, and of what."""
 _POSITIVE = ("first_learning_rate", "learning_rate", "first_seconds", "seconds")

@@ -28,10 +28,11 @@ from experiments.comparison import Trained, make_runners, notes, owner_of, table
 from experiments.config import Config
 from experiments.evaluate import Clip, Clips, Runner, evaluate
 from experiments.holes import mask_remark, mask_scores
-from experiments.progress import Phases
+from experiments.progress import Phases, TrainingProgress
 from experiments.report import print_table, write_report
 from experiments.report.classes import write_class_sheet
-from experiments.training import initial_variables, restore_stages, train_stages
+from experiments.tensorboard import Events, check_installed
+from experiments.training import initial_variables, read_losses, restore_stages, train_stages
 from experiments.variants import VARIANTS, compared, stages_of, trained_as
 from experiments.variants.classifier import thresholds
 
@@ -80,6 +81,7 @@ def run_experiment(
     wanted: Mapping[str, Any],
     eval_only: bool,
     console: Console,
+    tensorboard: bool = False,
 ) -> dict[str, Any]:
     """Run everything and write ``out / "metrics.json"`` and ``out / "report"``.
 
@@ -94,6 +96,7 @@ def run_experiment(
       wanted: what ``check_folder`` found to fit; kept in ``out / "run.json"`` as soon as there is data.
       eval_only: do not train, restore.
       console: where progress and tables are printed.
+      tensorboard: write TensorBoard events into the variants' folders.
 
     Returns:
       The content of ``metrics.json``.
@@ -101,6 +104,8 @@ def run_experiment(
     Raises:
       ValueError: settings or data that do not fit, or of which no frame would be scored.
     """
+    if tensorboard:
+        check_installed()
     if data is None:
         check_settings(names, configs)
     config, clock, seconds = configs[names[0]], time.monotonic(), {}
@@ -140,11 +145,15 @@ def run_experiment(
         write_json(out / "run.json", wanted)  # from here on there is something to resume
         lap("data")
 
-        trained = _train_all(names, configs, folders, dataset, initial, eval_only, phases, steps)
+        trained = _train_all(names, configs, folders, dataset, initial, eval_only, phases, steps, tensorboard)
         reports = stage_reports(trained)
         lap("training")
         # Of all sessions: the clock above saw only this one, which may have restored everything.
-        for part, key in {"compilation": "compile_seconds", "training": "seconds"}.items():
+        for part, key in {
+            "compilation": "compile_seconds",
+            "training": "seconds",
+            "validation": "validation_seconds",
+        }.items():
             seconds[part] = round(sum(report[key] for report in reports.values()), 1)
 
         phases.show("tuning", text="reading")
@@ -197,9 +206,11 @@ def run_experiment(
     remarks += notes(names, dataset, [clips.outline(n) for n in range(len(clips))], settings, config)
     remarks += [mask_remark(hole_scores)] if hole_scores else []
     remarks += [class_remark(name, scores) for name, scores in classes.items()]
+    losses = _losses(_trainings(names, configs), trained, folders)
     page = write_report(
-        out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references
-    )
+        out, metrics, curves=result["curves"], pictures=result["pictures"], notes=remarks, references=references,
+        training={stage: {**found, "loss": losses[stage]} for stage, found in reports.items()},
+    )  # fmt: skip
     lap("report")
     metrics["seconds"] = {**seconds, "total": round(sum(seconds.values()), 1)}
     write_json(out / "metrics.json", metrics)
@@ -229,6 +240,7 @@ def _train_all(
     eval_only: bool,
     phases: Phases,
     first_steps: Mapping[str, Any] | None,
+    tensorboard: bool,
 ) -> dict[str, Trained]:
     """Train (or restore) each variant that ``names`` take their weights from, once; the first with ``first_steps``."""
     trained: dict[str, Trained] = {}
@@ -242,41 +254,22 @@ def _train_all(
                     "VGG term off: give torchvision-layout VGG-16 weights with --set vgg=PATH to switch it on.",
                     soft_wrap=True,
                 )
-            shown = _TrainingProgress(phases, "" if len(names) == 1 else f"{base}: ")
             steps = None if trained else first_steps
-            variables, report = train_stages(
-                stages, dataset, config, folder, initial[name], shown.on_step, shown.on_compile, steps
-            )
+            events = Events(folder / "tensorboard") if tensorboard else None
+            watcher = TrainingProgress(phases, "" if len(names) == 1 else f"{base}: ", events)
+            with contextlib.closing(watcher):
+                variables, report = train_stages(stages, dataset, config, folder, initial[name], watcher, steps)
         trained[base] = Trained(initial[name], variables, config, report)
     return trained
 
 
-class _TrainingProgress:
-    """Shows the steps of stages; says at once where the gradient stays zero."""
-
-    def __init__(self, phases: Phases, prefix: str):
-        self.phases, self.prefix, self.still = phases, prefix, 0
-
-    def on_compile(self, stage: str) -> None:
-        self.still = 0
-        self.phases.show(f"train {self.prefix}{stage}", text="compiling (the clock of the training waits)")
-
-    def on_step(self, stage: str, step: int, fraction: float, terms: dict[str, float]) -> None:
-        self.still = 0 if terms["gradient_norm"] else self.still + 1
-        self.phases.show(f"train {self.prefix}{stage}", fraction, f"step {step}, loss {terms['loss']:.4f}")
-        if self.still == health.STILL_STEPS:
-            self.phases.console.print(
-                f"Dead network: {self.prefix}{stage}: the gradient is exactly zero since step "
-                f"{step - self.still + 1}. A smaller learning rate may keep it alive.", style="red", soft_wrap=True,
-            )  # fmt: skip
-
-
-def stage_reports(trained: Mapping[str, Trained]) -> dict[str, dict[str, Any]]:
-    """Stage -> what training it gave; of several variants "variant/stage"."""
+def stage_reports(trained: Mapping[str, Trained], only: str | None = None) -> dict[str, dict[str, Any]]:
+    """Stage -> what training it gave, of all variants or one; of several variants "variant/stage"."""
     return {
         stage if len(trained) == 1 else f"{base}/{stage}": report
         for base, found in trained.items()
         for stage, report in found.report.items()
+        if only in (None, base)
     }
 
 
@@ -298,6 +291,17 @@ def _dead_methods(
         if owner:
             messages += health.unchanged(row, runners[row], trained[owner].initial, clip)
     return messages
+
+
+def _losses(
+    trainings: Mapping[str, str], trained: Mapping[str, Trained], folders: Mapping[str, Path]
+) -> dict[str, list[tuple[int, float]]]:
+    """Stage, as in ``stage_reports``, -> step and loss of each of its steps."""
+    return {
+        key: read_losses(folders[name], stage)
+        for name, base in trainings.items()
+        for key, stage in zip(stage_reports(trained, base), trained[base].report, strict=True)
+    }
 
 
 def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str, Any]]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from essjax.color import display
 from essjax.rollout import alternate, every
+from essjax.train import best_validation
 from essjax.typing import PyTree
 from experiments.evaluate import Clip, Runner
 
@@ -30,9 +31,18 @@ def training_note(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """
     parts = [
         f"{stage} {_steps(found['steps'])} in {found['seconds']:.0f} s (compiled in {found['compile_seconds']:.0f} s)"
+        f"{_validations(found['validated'])}"
         for stage, found in reports.items()
     ]
     return [f"Training: {'; '.join(parts)}."] if parts else []
+
+
+def _validations(validated: Sequence[Mapping[str, float]]) -> str:
+    if not validated:
+        return ""
+    best = validated[best_validation(list(validated))]
+    scores = ", ".join(f"{kind.upper()} {value:.2f} dB" for kind, value in best.items() if kind != "step")
+    return f", kept as it was at step {best['step']}, the best of {len(validated)} validations ({scores})"
 
 
 def has_few_steps(reports: Mapping[str, Mapping[str, Any]]) -> bool:

@@ -7,6 +7,10 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from experiments import health
+from experiments.tensorboard import Events
+from experiments.training import Watcher
+
 
 class Phases:
     """Progress of named phases while it is entered.
@@ -73,3 +77,39 @@ _COLUMNS = (
     TextColumn("{task.fields[text]}", markup=False),  # names of sequences may have brackets
     TimeElapsedColumn(),
 )
+
+
+class TrainingProgress(Watcher):
+    """Shows the steps of stages; says at once where the gradient stays zero."""
+
+    def __init__(self, phases: Phases, prefix: str, events: Events | None = None):
+        self.phases, self.prefix, self.events, self.still = phases, prefix, events, 0
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self.events:
+            self.events.close()
+
+    def on_compile(self, stage):
+        """The bar says that it waits."""
+        self.still = 0
+        self.phases.show(f"train {self.prefix}{stage}", text="compiling (the clock of the training waits)")
+
+    def on_step(self, stage, step, progress, terms):
+        """The bar moves; a network that is dead by now is named."""
+        self.still = 0 if terms["gradient_norm"] else self.still + 1
+        self.phases.show(f"train {self.prefix}{stage}", progress, f"step {step}, loss {terms['loss']:.4f}")
+        if self.events:
+            self.events.add(stage, step, terms, group="train")
+        if self.still == health.STILL_STEPS:
+            self.phases.console.print(
+                f"Dead network: {self.prefix}{stage}: the gradient is exactly zero since step "
+                f"{step - self.still + 1}. A smaller learning rate may keep it alive.", style="red", soft_wrap=True,
+            )  # fmt: skip
+
+    def on_validation(self, stage, step, progress, scores):
+        """The bar shows the scores."""
+        found = ", ".join(f"{kind.upper()} {value:.2f} dB" for kind, value in scores.items()) or "validating"
+        self.phases.show(f"train {self.prefix}{stage}", progress, f"step {step}, {found}")
+        if self.events:
+            self.events.add(stage, step, scores, group="validation")

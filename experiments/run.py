@@ -20,6 +20,11 @@ def shared_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", dest="overrides", metavar="KEY=VALUE", nargs="+", action="extend", default=[])
     parser.add_argument("--resume", action="store_true", help="continue an interrupted run in --out")
     parser.add_argument("--eval-only", action="store_true", help="evaluate the checkpoint in --out, no training")
+    parser.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="write TensorBoard events (needs tensorboardX)",
+    )
     parser.add_argument("--list", action="store_true", help="list the variants and stop")
     parser.add_argument(
         "--no-compilation-cache", dest="compilation_cache", action="store_false",
@@ -105,7 +110,7 @@ def _run(options: argparse.Namespace, console: Console) -> int:
     check_folder(out, wanted, resume=options.resume, eval_only=options.eval_only)
     metrics = run_experiment(
         [name], {name: config}, {name: out}, preset=options.preset, overrides=options.overrides, data=options.data,
-        out=out, wanted=wanted, eval_only=options.eval_only, console=console,
+        out=out, wanted=wanted, eval_only=options.eval_only, console=console, tensorboard=options.tensorboard,
     )  # fmt: skip
     return exit_code(metrics, console)
 

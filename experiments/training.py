@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,23 +19,36 @@ from essjax.train import (
     Checkpoints,
     Recurrent,
     TrainState,
+    Validation,
+    chosen_variables,
     create_state,
     learning_rate,
     make_train_step,
     optimizer,
     read_progress,
+    restore_stage,
     train,
 )
 from essjax.typing import PyTree
 from experiments.config import Config
 from experiments.datasets import render_settings, train_clips
+from experiments.validation import Scorer
 from experiments.variants.base import Stage
 
 MIN_CROP = 24
-OnStep = Callable[[str, int, float, dict[str, float]], None]
-"""Called with stage, step, progress in [0, 1] and the terms."""
-OnCompile = Callable[[str], None]
-"""Called with the stage whose step is about to be compiled."""
+
+
+class Watcher:
+    """What a training tells; this one listens to nothing."""
+
+    def on_compile(self, stage: str) -> None:
+        """The step of ``stage`` is about to be compiled, or waited for."""
+
+    def on_step(self, stage: str, step: int, progress: float, terms: dict[str, float]) -> None:
+        """A step is done; progress in [0, 1]."""
+
+    def on_validation(self, stage: str, step: int, progress: float, scores: dict[str, float]) -> None:
+        """A validation begins (no scores), or is done."""
 
 
 def check_crop(config: Config, width: int, height: int) -> tuple[int, int]:
@@ -120,19 +134,22 @@ def first_batch(dataset: Dataset, config: Config, stage: Stage) -> Sequence:
     return next(make_batches(dataset, dataclasses.replace(config, fresh=None), stage, prefetch=1))
 
 
-def initial_state(stages: list[Stage], stage: Stage, variables: PyTree, batch: Sequence) -> TrainState:
+def initial_state(stages: list[Stage], stage: Stage, config: Config, variables: PyTree, batch: Sequence) -> TrainState:
     """What ``stage`` starts with: variables of its own and of the stages before it; a history where clips follow.
 
     Later stages' variables are not touched (nor saved) by it.
     """
     needed = {name: variables[name] for name in _entries(stages, stage)}
     history = stage.objective.start(batch) if isinstance(stage.objective, Recurrent) else None
-    return create_state(needed, stage.name, optimizer(), history=history)
+    return create_state(needed, stage.name, optimizer(), history=history, average=config.average is not None)
 
 
 def make_step(stage: Stage, config: Config) -> Callable:
     """The jitted step of a stage."""
-    return make_train_step(stage.objective, optimizer(), stage.name, compiler_options=config.compiler_options)
+    options = {} if config.average is None else {"average": config.average}
+    return make_train_step(
+        stage.objective, optimizer(), stage.name, compiler_options=config.compiler_options, **options
+    )
 
 
 def train_stages(
@@ -141,8 +158,7 @@ def train_stages(
     config: Config,
     out: Path,
     variables: PyTree,
-    on_step: OnStep,
-    on_compile: OnCompile = lambda stage: None,
+    watcher: Watcher,
     steps: Mapping[str, Any] | None = None,
 ) -> tuple[PyTree, dict[str, Any]]:
     """Train all stages in order, from ``variables``; one with a checkpoint at the end of its budget is only restored.
@@ -153,8 +169,7 @@ def train_stages(
       config: its settings.
       out: folder of checkpoints and logs.
       variables: the initial ones.
-      on_step: called after each step.
-      on_compile: called before a step is compiled, or waited for.
+      watcher: told what happens.
       steps: stage -> its step, where it is being compiled already (``Ahead.steps``).
 
     Returns:
@@ -162,10 +177,13 @@ def train_stages(
     """
     report = {}
     for stage in stages:
-        state = initial_state(stages, stage, variables, first_batch(dataset, config, stage))
+        state = initial_state(stages, stage, config, variables, first_batch(dataset, config, stage))
+        validation = None
+        if config.validations is not None:
+            validation = Validation(Scorer(stage.method, dataset, config), config.validations)
         checkpoints = Checkpoints(out / "checkpoints" / stage.name)
         try:
-            state, report[stage.name] = train(
+            kept, report[stage.name] = train(
                 (steps or {}).get(stage.name) or make_step(stage, config),
                 state,
                 make_batches(dataset, config, stage),
@@ -173,13 +191,16 @@ def train_stages(
                 out / "train" / f"{stage.name}.jsonl",
                 stage.budget,
                 functools.partial(learning_rate, peak=stage.learning_rate, decay=stage.decay),
+                trained=stage.name,
+                validation=validation,
                 save_every=config.save_every,
-                on_step=functools.partial(on_step, stage.name),
-                on_compile=functools.partial(on_compile, stage.name),
+                on_step=functools.partial(watcher.on_step, stage.name),
+                on_compile=functools.partial(watcher.on_compile, stage.name),
+                on_validation=functools.partial(watcher.on_validation, stage.name),
             )
         finally:
             checkpoints.close()
-        variables = {**variables, **state.variables}
+        variables = {**variables, **kept}
     return variables, report
 
 
@@ -210,12 +231,11 @@ def restore_stages(
             )
         checkpoints = Checkpoints(folder)
         try:
-            state, saved = checkpoints.restore(
-                initial_state(stages, stage, variables, first_batch(dataset, config, stage))
-            )
+            state = initial_state(stages, stage, config, variables, first_batch(dataset, config, stage))
+            state, best, saved = restore_stage(checkpoints, state, stage.name)
         finally:
             checkpoints.close()
-        variables = {**variables, **state.variables}
+        variables = {**variables, **chosen_variables(state, best, stage.name, saved)}
         report[stage.name] = {**read_progress(saved), "steps": int(state.step), "terms": {}}
     return variables, report
 
@@ -224,3 +244,10 @@ def _entries(stages: list[Stage], stage: Stage) -> list[str]:
     """Names of the variables that ``stage`` needs: its own and those of the stages before it."""
     names = [s.name for s in stages]
     return names[: names.index(stage.name) + 1]
+
+
+def read_losses(out: Path, stage: str) -> list[tuple[int, float]]:
+    """Step and loss of every step of a stage that was trained in ``out``; none where its log is gone."""
+    path = out / "train" / f"{stage}.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return [(line["step"], line["loss"]) for line in lines]

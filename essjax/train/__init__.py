@@ -1,7 +1,17 @@
 """Training: objectives, one jitted step, the loop, checkpoints."""
 
 from essjax.train.checkpoint import Checkpoints
-from essjax.train.loop import Budget, Interrupted, NonFiniteLoss, read_progress, train
+from essjax.train.loop import (
+    Budget,
+    Interrupted,
+    NonFiniteLoss,
+    Validation,
+    best_validation,
+    chosen_variables,
+    read_progress,
+    restore_stage,
+    train,
+)
 from essjax.train.objectives import (
     Objective,
     Recurrent,
@@ -18,13 +28,14 @@ from essjax.train.objectives import (
     odd_length,
     predict_last,
 )
-from essjax.train.state import TrainState, constant, cosine, create_state, halving, learning_rate, optimizer
+from essjax.train.state import TrainState, averaged, constant, cosine, create_state, halving, learning_rate, optimizer
 from essjax.train.step import make_train_step
 
 __all__ = [
-    "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "Recurrent", "TrainState", "both_kinds",
-    "classification_objective", "composition_objective", "constant", "cosine", "create_state", "dlctus_objective",
-    "extranet_objective", "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective",
-    "learning_rate", "make_train_step", "nsrr_objective", "odd_length", "optimizer", "predict_last", "read_progress",
+    "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "Recurrent", "TrainState", "Validation",
+    "averaged", "best_validation", "both_kinds", "chosen_variables", "classification_objective",
+    "composition_objective", "constant", "cosine", "create_state", "dlctus_objective", "extranet_objective",
+    "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective", "learning_rate",
+    "make_train_step", "nsrr_objective", "odd_length", "optimizer", "predict_last", "read_progress", "restore_stage",
     "train",
 ]  # fmt: skip

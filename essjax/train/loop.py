@@ -1,6 +1,6 @@
 """The training loop: a budget in steps or seconds, checkpoints, exact resumption, a stop on signals and on NaN.
 
-The clock counts training: a step with the wait for its batch, but neither compilation nor saving.
+The clock counts training: a step with the wait for its batch, but neither compilation nor validation nor saving.
 """
 
 import json
@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from essjax.train.checkpoint import Checkpoints
-from essjax.train.state import TrainState
+from essjax.train.state import TrainState, averaged
+from essjax.typing import PyTree
 
 
 class Interrupted(RuntimeError):
@@ -23,6 +25,18 @@ class Interrupted(RuntimeError):
 
 class NonFiniteLoss(RuntimeError):
     """A loss or gradient was NaN or infinite; the batch is saved, the last checkpoint is from before it."""
+
+
+class Validation(NamedTuple):
+    """How good the weights are on held-out data, several times in a stage; the best are kept.
+
+    Attributes:
+      score: variables -> kind of frame -> PSNR, dB; the mean over kinds counts.
+      times: how often, equally apart in the budget; the last time is at its end.
+    """
+
+    score: Callable[[PyTree], dict[str, float]]
+    times: int
 
 
 class Budget(NamedTuple):
@@ -52,10 +66,13 @@ def train(
     budget: Budget,
     schedule: Callable[[int, float], float],
     *,
+    trained: str,
+    validation: Validation | None = None,
     save_every: float = 30.0,
     on_step: Callable[[int, float, dict[str, float]], None] = lambda step, progress, terms: None,
     on_compile: Callable[[], None] = lambda: None,
-) -> tuple[TrainState, dict[str, Any]]:
+    on_validation: Callable[[int, float, dict[str, float]], None] = lambda step, progress, scores: None,
+) -> tuple[PyTree, dict[str, Any]]:
     """Run a stage to the end of its budget, from its newest checkpoint if there is one.
 
     Args:
@@ -67,23 +84,29 @@ def train(
       log_path: JSON lines, one per step; cut back to the checkpoint's step when a run resumes.
       budget: when to end.
       schedule: learning rate of step and progress in [0, 1].
+      trained: the entry of the variables that is trained.
+      validation: which weights are kept; None: the last.
       save_every: seconds between checkpoints.
       on_step: called with step, progress and the terms of that step.
       on_compile: called before the step is compiled, if it has to be.
+      on_validation: called before each validation with step, progress and nothing, and after it with its scores.
 
     Returns:
-      The final state and a summary of all runs together: ``steps``; ``seconds`` of training; ``compile_seconds``;
-      ``still``, how many steps up to the last had a gradient of exactly zero; ``terms`` of the last step.
+      The variables that were best in validation, averaged where the state holds an average, and a summary of all runs
+      together: ``steps``; ``seconds`` of training; ``compile_seconds`` and ``validation_seconds``; ``still``, how many
+      steps up to the last had a gradient of exactly zero; ``validated``, step and scores of each validation; ``terms``
+      of the last step.
 
     Raises:
       Interrupted: a signal came; everything is saved.
       NonFiniteLoss: names the terms; the batch is in ``log_path``'s folder.
     """
-    spent = read_progress({})
+    spent, best = read_progress({}), state.variables[trained]
     if checkpoints.latest() is not None:
-        state, saved = checkpoints.restore(state)
+        state, best, saved = restore_stage(checkpoints, state, trained)
         spent = read_progress(saved)
         batches.set_state(saved["batches"])  # type: ignore[attr-defined]
+    best = jax.tree.map(np.asarray, best)  # the step donates its state
     step, terms = int(state.step), {}
     _truncate(log_path, step)
     last_save = time.monotonic()
@@ -91,7 +114,8 @@ def train(
 
         def save():
             log.flush()
-            checkpoints.save(step, state, {**spent, "batches": batches.get_state()})  # type: ignore[attr-defined]
+            so_far = {**spent, "batches": batches.get_state()}  # type: ignore[attr-defined]
+            checkpoints.save(step, {"state": state, "best": best}, so_far)
 
         def progress() -> float:
             return budget.progress(step, spent["seconds"])
@@ -113,21 +137,53 @@ def train(
             spent["still"] = 0 if terms["gradient_norm"] else spent["still"] + 1
             log.write(json.dumps({"step": step, "seconds": round(spent["seconds"], 2), **terms}) + "\n")
             on_step(step, progress(), terms)
+            if validation and int(progress() * validation.times) > len(spent["validated"]):
+                on_validation(step, progress(), {})
+                began, candidate = time.monotonic(), averaged(state, trained)
+                scores = validation.score(candidate)
+                spent["validated"].append({"step": step, **scores})
+                if best_validation(spent["validated"]) == len(spent["validated"]) - 1:
+                    best = jax.tree.map(np.asarray, candidate[trained])
+                spent["validation_seconds"] += time.monotonic() - began
+                on_validation(step, progress(), scores)
             if time.monotonic() - last_save > save_every:
                 save()
                 last_save = time.monotonic()
         save()
         if stop.set and progress() < 1.0:
             raise Interrupted(f"stopped at step {step}; the state is saved. Run the same command with --resume.")
-    return state, {"steps": step, **spent, "terms": terms}
+    return chosen_variables(state, best, trained, spent), {"steps": step, **spent, "terms": terms}
+
+
+def restore_stage(
+    checkpoints: Checkpoints, state: TrainState, trained: str
+) -> tuple[TrainState, PyTree, dict[str, Any]]:
+    """The newest checkpoint of a stage that starts with ``state``: its state, the best entry so far, its progress."""
+    found, saved = checkpoints.restore({"state": state, "best": state.variables[trained]})
+    return found["state"], found["best"], saved
+
+
+def chosen_variables(state: TrainState, best: PyTree, trained: str, progress: dict[str, Any]) -> PyTree:
+    """The variables that a stage ends with: the best of its validations, without any the last (averaged) ones."""
+    if progress.get("validated"):
+        return {**state.variables, trained: jax.tree.map(jnp.asarray, best)}
+    return averaged(state, trained)
+
+
+def best_validation(validated: list[dict[str, float]]) -> int:
+    """Index of the best: mean PSNR over kinds, not finite is the worst; of equally good ones the last."""
+
+    def mean(scores: dict[str, float]) -> float:
+        value = float(np.mean([value for name, value in scores.items() if name != "step"]))
+        return value if np.isfinite(value) else -np.inf
+
+    return max(range(len(validated)), key=lambda n: (mean(validated[n]), n))
 
 
 def read_progress(saved: dict[str, Any]) -> dict[str, Any]:
-    """``seconds``, ``compile_seconds`` and ``still`` of a checkpoint's progress, see ``train``; zero where absent."""
-    return {name: saved.get(name, nothing) for name, nothing in _NOTHING.items()}
-
-
-_NOTHING = {"seconds": 0.0, "compile_seconds": 0.0, "still": 0}
+    """What a checkpoint's progress says of the stage so far, see ``train``; nothing where it is absent."""
+    nothing = {"seconds": 0.0, "compile_seconds": 0.0, "validation_seconds": 0.0, "still": 0, "validated": []}
+    return {name: saved.get(name, value) for name, value in nothing.items()}
 
 
 def _raise_non_finite(step: int, terms: dict[str, float], batch: Any, folder: Path) -> None:

@@ -5,6 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 
 from essjax.typing import Array, Callable, PyTree, pytree
 
@@ -21,12 +22,14 @@ class TrainState:
       optimizer: optax state of the trained entry, its arrays behind each other as one vector.
       step: steps taken, int32.
       history: what the next clip goes on from where clips follow each other (``Recurrent``), else None.
+      average: moving average of the trained weights, as one vector; or None.
     """
 
     variables: PyTree
     optimizer: PyTree
     step: Array
     history: PyTree = None
+    average: Array | None = None
 
 
 def optimizer(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
@@ -39,9 +42,16 @@ def optimizer(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
 
 
 def create_state(
-    variables: PyTree, trained: str, transform: optax.GradientTransformation, *, history: PyTree = None
+    variables: PyTree,
+    trained: str,
+    transform: optax.GradientTransformation,
+    *,
+    history: PyTree = None,
+    average: bool = False,
 ) -> TrainState:
     """A state at step 0 that trains ``variables[trained]``; with ``history`` (``Recurrent.start``) on successive clips.
+
+    With ``average`` the weights are averaged over the steps, see ``averaged``.
 
     Raises:
       ValueError: there is no such entry.
@@ -51,7 +61,29 @@ def create_state(
     variables, history = jax.tree.map(jnp.array, (variables, history))  # copies: the train step donates its state
     weights, _ = split_statistics(variables[trained])
     step = jnp.zeros((), jnp.int32)
-    return TrainState(variables=variables, optimizer=transform.init(weights), step=step, history=history)
+    mean = jnp.array(ravel_pytree(weights)[0]) if average else None
+    return TrainState(variables=variables, optimizer=transform.init(weights), step=step, history=history, average=mean)
+
+
+def averaged(state: TrainState, trained: str) -> PyTree:
+    """The variables with the moving average of the trained weights in place of the last ones, if there is one."""
+    if state.average is None:
+        return state.variables
+    weights, statistics = split_statistics(state.variables[trained])
+    return {**state.variables, trained: {**ravel_pytree(weights)[1](state.average), **statistics}}
+
+
+def update_average(average: Array, weights: PyTree, step: Array, decay: float) -> Array:
+    """The moving average after one more step: over about 1 / (1 - decay) steps, over a tenth of them at first.
+
+    Args:
+      average: before the step, one vector.
+      weights: after it.
+      step: steps taken before it.
+      decay: in [0, 1).
+    """
+    decay = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
+    return average + (1.0 - decay) * (ravel_pytree(weights)[0] - average)
 
 
 def split_statistics(entry: PyTree) -> tuple[PyTree, PyTree]:

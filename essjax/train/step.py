@@ -9,7 +9,7 @@ import optax
 
 from essjax.frames import Sequence
 from essjax.train.objectives import Objective, Recurrent
-from essjax.train.state import TrainState, split_statistics
+from essjax.train.state import TrainState, split_statistics, update_average
 from essjax.typing import Array, Callable, PyTree
 
 
@@ -18,6 +18,7 @@ def make_train_step(
     transform: optax.GradientTransformation,
     trained: str,
     *,
+    average: float = 0.99,
     compiler_options: dict[str, Any] | None = None,
 ) -> Callable[[TrainState, Sequence, float], tuple[TrainState, dict[str, Array]]]:
     """``step(state, clip, learning_rate) -> (state, terms)``, jitted, the state donated.
@@ -31,6 +32,7 @@ def make_train_step(
         into the variables, those of frozen entries are not.
       transform: the optimiser, without its learning rate.
       trained: the entry of ``variables`` that is differentiated; the others are frozen.
+      average: decay of the moving average of the weights, where the state holds one.
       compiler_options: for ``jax.jit``.
     """
 
@@ -57,7 +59,12 @@ def make_train_step(
         old = (state.variables[trained], state.optimizer, state.history)
         entry, new_optimizer, history = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
         variables = {**state.variables, trained: entry}
-        state = TrainState(variables=variables, optimizer=new_optimizer, step=state.step + 1, history=history)
+        mean = state.average
+        if mean is not None:
+            mean = update_average(mean, split_statistics(entry)[0], state.step, average)
+        state = TrainState(
+            variables=variables, optimizer=new_optimizer, step=state.step + 1, history=history, average=mean
+        )
         return state, {**terms, "loss": total, "gradient_norm": norm}
 
     return step

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.report import images as pixels
+from experiments.report.learning import learning_section
 from experiments.report.pictures import Picture, make_picture
 from experiments.report.rows import (
     COLUMNS,
@@ -36,6 +37,7 @@ def write_report(
     pictures: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
     references: Mapping[str, str] | None = None,
+    training: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Path:
     """Write ``out_dir/report/index.html`` (works offline, in any browser) and ``out_dir/report/sheets/*.png``.
 
@@ -50,6 +52,7 @@ def write_report(
         Most interesting first: what does not fit the size limit is left out from the end.
       notes: remarks to the reader, one paragraph each.
       references: methods shown for orientation, never marked best, with the reason.
+      training: how each stage learned, see ``learning_section``.
 
     Returns:
       The path of the page.
@@ -70,7 +73,7 @@ def write_report(
     _write_sheets(sheets, chosen)
     path = folder / "index.html"
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(_page(metrics, curves or {}, data, notes, references or {}), encoding="utf-8")
+    temporary.write_text(_page(metrics, curves or {}, data, notes, references or {}, training or {}), encoding="utf-8")
     temporary.replace(path)
     return path
 
@@ -116,7 +119,12 @@ def _write_sheets(folder: Path, pictures: Sequence[Picture]) -> None:
 
 
 def _page(
-    metrics: Mapping[str, Any], curves: Curves, pictures: list[dict], notes: list[str], references: Mapping[str, str]
+    metrics: Mapping[str, Any],
+    curves: Curves,
+    pictures: list[dict],
+    notes: list[str],
+    references: Mapping[str, str],
+    training: Mapping[str, Mapping[str, Any]],
 ) -> str:
     data = {
         "variant": metrics["variant"], "curves": _round(curves), "pictures": pictures, "references": list(references),
@@ -140,6 +148,7 @@ def _page(
         "sequences": "".join(options),
         "tables": "\n".join(_table(table) for table in tables if table.lines),
         "help": "".join(help_lines),
+        "learning": learning_section(training),
         "costs": _costs(metrics.get("costs") or {}),
         # A "</script>" inside the data would end the element that holds it.
         "data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),

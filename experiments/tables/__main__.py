@@ -71,7 +71,7 @@ def _fill(group: list, options: argparse.Namespace, out: Path, console: Console)
                 costs[name] = method_cost(method, 1280, 720)
     metrics = compare(
         names, preset=options.preset, overrides=overrides, data=options.data, out=out, resume=options.resume,
-        eval_only=options.eval_only, console=console,
+        eval_only=options.eval_only, console=console, tensorboard=options.tensorboard,
     )  # fmt: skip
     keys = ("dataset", "environment", "seconds")
     return (

@@ -34,6 +34,9 @@ def test_overrides_are_typed():
         ("quick", ["first_seconds=Infinity"], "--set first_seconds: expected a number above 0, got inf"),
         ("quick", ["learning_rate=NaN"], "--set learning_rate: expected a number above 0, got nan"),
         ("quick", ["vgg_weight=NaN"], "--set vgg_weight: expected at least 0, got nan"),
+        ("quick", ["average=1"], r"--set average: expected a decay in \[0, 1\), got 1"),
+        ("quick", ["average=NaN"], r"--set average: expected a decay in \[0, 1\), got nan"),
+        ("quick", ["validations=0"], "--set validations: expected at least 1 validation, got 0"),
         ("quick", ["mip_bias=-Infinity"], "--set mip_bias: expected a finite number, got -inf"),
     ],
 )
@@ -45,7 +48,7 @@ def test_bad_settings_say_what_is_valid(preset, overrides, message):
 def test_every_number_has_a_bound():
     kinds = (int, float, int | None, float | None)
     numbers = {field.name for field in dataclasses.fields(Config) if field.type in kinds}
-    assert numbers - {"mip_bias"} == set(_LEAST) | set(_POSITIVE)
+    assert numbers - {"mip_bias", "average"} == set(_LEAST) | set(_POSITIVE)
 
 
 def test_every_preset_passes_its_own_check():

@@ -60,7 +60,7 @@ def train(name, dataset):
         batch, losses[stage.name] = next(make_batches(dataset, config, stage)), []
         expected = batch_shapes(config, stage)  # what the run command compiles for, before there are data
         assert_same_shapes(expected, batch)
-        assert_same_shapes(state_shapes(stages, stage, expected), state)
+        assert_same_shapes(state_shapes(stages, stage, config, expected), state)
         for _ in range(STEPS):
             state, terms = step(state, batch, stage.learning_rate)
             losses[stage.name].append(float(terms["loss"]))

@@ -105,13 +105,14 @@ def dataset(cuts, score_from=0):
         ({"a": [0], "b": [0, 4]}, 0, ["warmup=4"], "split test: expected frames .*, got none in b: all are"),
         ({"a": [0], "b": []}, 0, ["warmup=20"], r"none in a, b: all are among the 20 that .* --set warmup=N\."),
         ({"a": [0]}, 7, ["tune=true", "warmup=8"], "split validation: expected frames to score"),
+        ({"a": [0]}, 7, ["validations=1", "warmup=8"], "split validation: expected frames to score"),
         ({"a": [], "b": [0, 4]}, 0, ["warmup=3"], ""),
         ({"a": [0, 3]}, 7, ["warmup=4"], ""),  # the last frame alone
         ({"a": [0, 3]}, 7, ["warmup=5"], "split test"),
     ],
 )
 def test_data_of_which_nothing_would_be_scored(cuts, score_from, overrides, message):
-    config = make_config("smoke", overrides)
+    config = make_config("smoke", ["validations=null", *overrides])
     if not message:
         check_scored(dataset(cuts, score_from), config)
         return

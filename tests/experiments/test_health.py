@@ -9,13 +9,12 @@ from rich.console import Console
 
 from experiments import health
 from experiments.evaluate import Clip, Runner
-from experiments.experiment import _TrainingProgress
-from experiments.progress import Phases
+from experiments.progress import Phases, TrainingProgress
 from experiments.run import exit_code
 
 
 def report(steps, still=0):
-    return {"steps": steps, "seconds": 45.2, "compile_seconds": 21.0, "still": still, "terms": {}}
+    return {"steps": steps, "seconds": 45.2, "compile_seconds": 21.0, "still": still, "validated": [], "terms": {}}
 
 
 def test_how_long_it_trained():
@@ -23,6 +22,10 @@ def test_how_long_it_trained():
         "Training: frnet 1 step in 45 s (compiled in 21 s); extrassnet 250 steps in 45 s (compiled in 21 s)."
     ]
     assert health.training_note({}) == []
+    validated = [{"step": step, "ess": psnr} for step, psnr in ((50, 22.0), (100, 22.126), (150, 22.1))]
+    assert health.training_note({"frnet": {**report(150), "validated": validated}})[0].endswith(
+        "(compiled in 21 s), kept as it was at step 100, the best of 3 validations (ESS 22.13 dB)."
+    )
 
 
 def test_few_steps():
@@ -91,7 +94,7 @@ def test_a_dead_network_is_named_while_it_trains_and_when_the_command_ends():
     output = io.StringIO()
     console = Console(file=output, width=200)
     with Phases(console) as phases:
-        shown = _TrainingProgress(phases, "dlctus: ")
+        shown = TrainingProgress(phases, "dlctus: ")
         shown.on_compile("net")
         for step in range(1, 40):
             shown.on_step("net", step, step / 40, {"loss": 0.1, "gradient_norm": 0.1 if step < 20 else 0.0})

@@ -267,3 +267,22 @@ def test_costs_stand_in_a_table_of_their_own(report):
     _, page = report
     assert '<th scope="row">extrass</th><td>262,141</td><td>1.500</td><td>2.000</td><td>0</td>' in page
     assert '<th scope="row">ifrnet</th><td>7</td><td>0.000</td><td>–</td><td>1</td>' in page
+
+
+def test_how_training_went_is_shown_without_a_script(tmp_path):
+    loss = [(step, 0.5 / step) for step in range(1, 1001)]
+    validated = [{"step": 300, "ss": 20.0, "ess": 19.0}, {"step": 1000, "ss": 21.5, "ess": 19.5}]
+    training = {
+        "a <b>": {"loss": loss, "validated": validated},
+        "few": {"loss": loss[:1], "validated": validated[:1]},  # one point is no curve
+        "broken": {"loss": loss[:2], "validated": [{"step": 1, "ss": float("nan")}, {"step": 2, "ss": float("inf")}]},
+    }
+    text = write_report(tmp_path, make_metrics(), training=training).read_text()
+    assert re.findall(r"<figcaption>([^<]*): (loss|validation, dB)<", text) == [
+        ("a &lt;b&gt;", "loss"), ("a &lt;b&gt;", "validation, dB"), ("broken", "loss")
+    ]  # fmt: skip
+    lines = [line.split() for line in re.findall(r'<polyline points="([^"]*)"', text)]
+    assert [len(line) for line in lines] == [143, 2, 2, 2]  # loss, ESS and SS in the order of the scores, loss
+    heights = [float(point.split(",")[1]) for point in lines[0]]
+    assert heights == sorted(heights) and ">21.5<" in text and ">19<" in text and ">step 1000<" in text
+    assert "Learning" not in write_report(tmp_path, make_metrics()).read_text()

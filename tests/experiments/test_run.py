@@ -45,10 +45,12 @@ def test_metrics_json(finished):
     assert metrics["overrides"] == overrides
     assert metrics["configs"]["extrass"]["size"] == [32, 24] and metrics["configs"]["extrass"]["width"] == 8
     assert {"commit", "device", "versions", "seed"} <= set(metrics["environment"])
-    phases = {"data", "compilation", "training", "tuning", "evaluation", "report", "total"}
+    phases = {"data", "compilation", "training", "validation", "tuning", "evaluation", "report", "total"}
     assert set(metrics["seconds"]) == phases and metrics["seconds"]["compilation"] >= 0
     assert {stage: found["steps"] for stage, found in metrics["training"].items()} == metrics["environment"]["steps"]
     assert metrics["dead"] == [] and len(metrics["warnings"]) == 2
+    validated = {stage: [list(entry) for entry in found["validated"]] for stage, found in metrics["training"].items()}
+    assert validated == {"frnet": 2 * [["step", "ess"]], "extrassnet": 2 * [["step", "ess", "ss"]]}
     means = {(r["method"], r["frames"], r["resolution"]): r for r in metrics["rows"] if r["sequence"] == "mean"}
     assert set(means) == {
         ("extrass", "ss", "hr"), ("extrass", "ess", "hr"), ("bilinear", "ss", "hr"),

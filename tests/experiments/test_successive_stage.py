@@ -27,14 +27,15 @@ def test_the_history_is_part_of_what_a_stage_starts_with_and_comes_back(tmp_path
 
     variables = initial_variables(stages, dataset, config)
     batch = first_batch(dataset, config, last)
-    state = initial_state(stages, last, variables, batch)
-    assert initial_state(stages, flow, variables, first_batch(dataset, config, flow)).history is None
+    state = initial_state(stages, last, config, variables, batch)
+    assert initial_state(stages, flow, config, variables, first_batch(dataset, config, flow)).history is None
     assert state.history.inner.image.shape == (2, 2, 48, 64, 3)  # both runs
     for stage in stages:
-        saved = initial_state(stages, stage, variables, batch)
+        saved = initial_state(stages, stage, config, variables, batch)
         saved = dataclasses.replace(saved, variables=jax.tree.map(lambda leaf: leaf + 1.0, saved.variables))
         checkpoints = Checkpoints(tmp_path / "out" / "checkpoints" / stage.name)
-        checkpoints.save(3, saved, {"seconds": 2.0})
+        content = {"state": saved, "best": saved.variables[stage.name]}
+        checkpoints.save(3, content, {"seconds": 2.0, "validated": [{"step": 3, "ss": 20.0}]})
         checkpoints.close()
     restored, report = restore_stages(stages, dataset, config, tmp_path / "out", variables)
     assert report["extrassnet"]["steps"] == 0 and report["extrassnet"]["seconds"] == 2.0

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from essjax.train import Budget, Interrupted, NonFiniteLoss
+from essjax.train import Budget, Interrupted, NonFiniteLoss, Validation, best_validation
 from tests.train import tiny_run
 
 
@@ -28,7 +28,7 @@ def uninterrupted(tmp_path_factory):
     """Folder and final state of a run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("uninterrupted")
     state, summary = tiny_run.run(folder)
-    assert summary["steps"] == tiny_run.STEPS == int(state.step)
+    assert summary["steps"] == tiny_run.STEPS == int(state["state"].step)
     return folder, state
 
 
@@ -124,6 +124,74 @@ class Batches:
 
     def set_state(self, state):
         self.batches.set_state(state)
+
+
+def test_the_best_averaged_weights_are_kept(uninterrupted):
+    """Steps 3, 6, 9 and 12 are validated; the score falls after its peak, so the last weights are not the best."""
+    _, end = uninterrupted
+    assert [entry["step"] for entry in end["validated"]] == [3, 6, 9, 12]
+    scores = [entry["ss"] for entry in end["validated"]]
+    score = tiny_run.validation().score
+    np.testing.assert_allclose(score(end["variables"])["ss"], max(scores), rtol=1e-5)
+    averages = {"fit": {"w": end["state"].average}}
+    np.testing.assert_allclose(score(averages)["ss"], scores[-1], rtol=1e-5)
+    assert scores[-1] < max(scores) and np.any(end["state"].average != end["state"].variables["fit"]["w"])
+    np.testing.assert_array_equal(end["variables"]["fit"]["w"], end["best"]["w"])
+    assert end["variables"]["frozen"] == {"b": 1.0}
+
+
+def test_without_validation_the_average_is_kept(tmp_path, uninterrupted):
+    end, _ = tiny_run.run(tmp_path, validation=None)
+    np.testing.assert_array_equal(end["variables"]["fit"]["w"], end["state"].average)
+    jax.tree.map(np.testing.assert_array_equal, end["state"], uninterrupted[1]["state"])
+    assert end["validated"] == []
+
+
+def test_kill_in_a_validation_and_resume(tmp_path, uninterrupted):
+    """Nothing of a validation that was torn is left: here its second one raises, with a checkpoint after each step."""
+    calls = []
+
+    def score(variables):
+        calls.append(len(calls))
+        if len(calls) == 2:
+            raise RuntimeError("killed")
+        return tiny_run.validation().score(variables)
+
+    with pytest.raises(RuntimeError, match="killed"):
+        tiny_run.run(tmp_path, validation=Validation(score, 4), save_every=0.0)
+    end, _ = tiny_run.run(tmp_path)
+    assert_same_run(tmp_path, end, uninterrupted)
+
+
+@pytest.mark.parametrize(
+    ("scores", "best"),
+    [
+        ([20.0], 0),
+        ([20.0, 21.0], 1),
+        ([21.0, 20.0], 0),
+        ([20.0, 20.0], 1),  # as good, and seen more
+        ([np.nan], 0),
+        ([20.0, np.nan], 0),
+        ([np.nan, 20.0], 1),
+        ([np.nan, np.nan], 1),
+    ],
+)
+def test_the_best_validation(scores, best):
+    validated = [{"step": 1000 - n, "ss": score, "ess": score} for n, score in enumerate(scores)]
+    assert best_validation(validated) == best
+    assert (
+        best_validation([{"step": 1, "ss": 20.0, "ess": 20.1}, {"step": 2, "ss": 30.0, "ess": 10.0}]) == 0
+    )  # the mean
+
+
+def test_validation_is_announced_and_not_on_the_clock(tmp_path):
+    events = []
+    _, summary = tiny_run.run(
+        tmp_path, validation=Validation(lambda variables: time.sleep(0.3) or {"ss": 1.0}, 2), budget=Budget(4, 0.5),
+        on_validation=lambda step, progress, scores: events.append((step, scores)),
+    )  # fmt: skip
+    assert events == [(2, {}), (2, {"ss": 1.0}), (4, {}), (4, {"ss": 1.0})]
+    assert summary["seconds"] < 0.5 and summary["validation_seconds"] > 0.6
 
 
 def test_clock_ends_a_stage(tmp_path):

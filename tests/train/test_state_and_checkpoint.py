@@ -12,6 +12,7 @@ import pytest
 from essjax.train import (
     Checkpoints,
     Recurrent,
+    averaged,
     constant,
     cosine,
     create_state,
@@ -92,6 +93,31 @@ def test_one_step_equals_adam_by_hand():
     np.testing.assert_allclose(state.variables["fit"]["w"], expected, rtol=1e-4)
     np.testing.assert_array_equal(state.variables["frozen"]["b"], 1.0)
     assert int(state.step) == 1
+
+
+def test_the_average_forgets_the_start():
+    """NumPy's recursion: over a tenth of the steps at first, over 1 / (1 - decay) of them later."""
+    state, clip = tiny_run.initial_state(), next(tiny_run.tiny_batches())
+    mean = np.zeros(3)
+    for n in range(12):
+        state, _ = tiny_run.tiny_step()(state, clip, 0.1)
+        decay = min(0.5, (1 + n) / (10 + n))
+        mean = decay * mean + (1 - decay) * np.asarray(state.variables["fit"]["w"])
+        np.testing.assert_allclose(state.average, mean, rtol=1e-5)
+    variables = averaged(state, "fit")
+    np.testing.assert_allclose(variables["fit"]["w"], mean, rtol=1e-5)
+    assert variables["frozen"] is state.variables["frozen"]
+    plain = tiny_run.initial_state(average=False)
+    assert plain.average is None and averaged(plain, "fit") is plain.variables
+    plain, _ = tiny_run.tiny_step()(plain, clip, 0.1)
+    assert plain.average is None
+
+
+def test_statistics_are_not_averaged():
+    entry = {"params": {"w": jnp.ones((2, 1)), "b": jnp.zeros(3)}, "batch_stats": {"mean": jnp.full(2, 3.0)}}
+    state = create_state({"net": entry}, "net", optimizer(), average=True)
+    assert state.average.shape == (5,)
+    jax.tree.map(np.testing.assert_array_equal, averaged(state, "net"), {"net": entry})
 
 
 def test_non_finite_step_changes_nothing_but_the_count():

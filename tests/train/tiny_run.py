@@ -15,7 +15,17 @@ import numpy as np
 
 from essjax.data import clips
 from essjax.frames import select_time
-from essjax.train import Budget, Checkpoints, create_state, learning_rate, make_train_step, optimizer, train
+from essjax.train import (
+    Budget,
+    Checkpoints,
+    Validation,
+    create_state,
+    learning_rate,
+    make_train_step,
+    optimizer,
+    restore_stage,
+    train,
+)
 from tests.helpers import make_sequence
 
 STEPS = 12
@@ -38,15 +48,24 @@ def objective(variables, clip):
     return terms, {}
 
 
-def initial_state():
+def initial_state(average=True):
     """``fit`` is trained, ``frozen`` is not."""
-    return create_state({"fit": {"w": jnp.zeros(3)}, "frozen": {"b": jnp.ones(())}}, "fit", optimizer())
+    variables = {"fit": {"w": jnp.zeros(3)}, "frozen": {"b": jnp.ones(())}}
+    return create_state(variables, "fit", optimizer(), average=average)
 
 
 @functools.cache
 def tiny_step():
     """The jitted step, compiled once per process."""
-    return make_train_step(objective, optimizer(), "fit")
+    return make_train_step(objective, optimizer(), "fit", average=0.5)
+
+
+def validation(times=4):
+    """Scores that first rise, then fall: of steps 3, 6, 9 and 12 the third are the best weights."""
+    target = jnp.array([0.1, 0.11, 0.12])
+    return Validation(
+        lambda variables: {"ss": float(-jnp.sum((variables["fit"]["w"] - target) ** 2)), "ess": 1.0}, times
+    )
 
 
 def tiny_batches(seed=0):
@@ -54,17 +73,19 @@ def tiny_batches(seed=0):
     return iter(clips(sequences(), length=3, batch=2, crop=(3, 4), seed=seed, threads=1, prefetch=1))
 
 
-def run(folder, *, step=None, budget=None, save_every=1e9, batches=None, **callbacks):
-    """Train in ``folder`` from its newest checkpoint, if any."""
+def run(folder, *, step=None, budget=None, save_every=1e9, batches=None, **options):
+    """Train in ``folder`` from its newest checkpoint, if any: all that it leaves behind, and its summary."""
     checkpoints = Checkpoints(Path(folder) / "checkpoints")
     try:
-        return train(
+        variables, summary = train(
             step or tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
-            budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), save_every=save_every,
-            **callbacks,
+            budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), trained="fit",
+            save_every=save_every, **{"validation": validation(), **options},
         )  # fmt: skip
+        state, best, _ = restore_stage(checkpoints, initial_state(), "fit")
     finally:
         checkpoints.close()
+    return {"variables": variables, "state": state, "best": best, "validated": summary["validated"]}, summary
 
 
 if __name__ == "__main__":

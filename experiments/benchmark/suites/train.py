@@ -104,7 +104,7 @@ def _loaded(*settings: str) -> Row:
         transform = optimizer()
         step = make_train_step(stage.objective, transform, stage.name)
         variables = initial_variables([stage], dataset, config)
-        state = initial_state([stage], stage, variables, first_batch(dataset, config, stage))
+        state = initial_state([stage], stage, config, variables, first_batch(dataset, config, stage))
         batches, waited, seconds = make_batches(dataset, config, stage), [], []
         for n in range(LOADED_STEPS + 2):
             start = time.perf_counter()
