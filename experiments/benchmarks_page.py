@@ -21,6 +21,8 @@ COLUMNS = {
     "psnr": "PSNR", "ssim": "SSIM", "psnr_holes": "PSNR in holes", "tpsnr": "PSNR of frame differences",
     "psnr_foreground": "PSNR of the foreground", "psnr_reference": "foreground against the reference",
 }  # fmt: skip
+PACE = ("steps", "seconds", "compile_seconds")
+"""Of each stage of a run, for its pace."""
 HEAD = """# Benchmarks
 
 Generated from `experiments/results/*.json` by `python -m experiments.benchmarks_page`; do not edit. Each table is the
@@ -61,6 +63,10 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
         merged["environment"] = {**environments[0], **{part: [e[part] for e in environments] for part in parts}}
         merged["seconds"] = {
             part: round(sum(run["seconds"][part] for run in runs) / len(runs), 1) for part in runs[0]["seconds"]
+        }
+        merged["training"] = {
+            stage: {part: sum(run["training"][stage][part] for run in runs) / len(runs) for part in PACE}
+            for stage in runs[0].get("training", {})
         }
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(merged, indent=1) + "\n")
@@ -172,6 +178,7 @@ def _section(name: str, metrics: dict[str, Any]) -> str:
         f"Commit {', '.join(dict.fromkeys(commits))}; {environment['device']}; jax {versions['jax']}, Python "
         f"{versions['python']}; {seed}; steps: {steps}.",
         "Seconds: " + ", ".join(f"{part} {value:g}" for part, value in metrics["seconds"].items()) + ".",
+        *_pace(metrics.get("training") or {}),
         "",
     ]
     for resolution, title in (("hr", "High resolution"), ("lr", "Low resolution")):
@@ -185,6 +192,17 @@ def _section(name: str, metrics: dict[str, Any]) -> str:
                 lines.append(f"| {row['method']} | {row['frames'].upper()} | " + " | ".join(values) + " |")
             lines.append("")
     return "\n".join(lines)
+
+
+def _pace(training: dict[str, Any]) -> list[str]:
+    """How fast each stage trained; nothing for runs older than the measurement."""
+    parts = [
+        f"{stage} {found['steps'] / found['seconds']:.2f} steps per second (waited {found['compile_seconds']:.0f} s "
+        "for its compilation)"
+        for stage, found in training.items()
+        if found["seconds"]
+    ]
+    return [f"Pace: {', '.join(parts)}."] if parts else []
 
 
 def _number(value: float | None, column: str) -> str:

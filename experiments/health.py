@@ -30,8 +30,8 @@ def training_note(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
       reports: stage -> what ``essjax.train.train`` says of it.
     """
     parts = [
-        f"{stage} {_steps(found['steps'])} in {found['seconds']:.0f} s (compiled in {found['compile_seconds']:.0f} s)"
-        f"{_validations(found['validated'])}"
+        f"{stage} {_steps(found['steps'])} in {found['seconds']:.0f} s (waited {found['compile_seconds']:.0f} s to be "
+        f"compiled){_validations(found['validated'])}"
         for stage, found in reports.items()
     ]
     return [f"Training: {'; '.join(parts)}."] if parts else []

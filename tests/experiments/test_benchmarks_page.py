@@ -45,6 +45,24 @@ def test_runs_with_several_seeds_become_mean_and_range(tmp_path, monkeypatch):
         benchmarks_page.keep("mixed", [paths[0], run(tmp_path / "other", 1.0, dataset="other")])
 
 
+def test_the_pace_of_the_training_is_shown(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmarks_page, "RESULTS", tmp_path)
+    made = [
+        {"seconds": 50.0, "steps": steps, "compile_seconds": waited, "still": 0}
+        for steps, waited in ((100, 20), (200, 0))
+    ]
+    idle = {"seconds": 0.0, "steps": 0, "compile_seconds": 0.0}
+    paths = [
+        run(tmp_path / str(seed), 23.0, seed=seed, training={"frnet": found, "idle": idle})
+        for seed, found in enumerate(made)
+    ]
+    benchmarks_page.keep("one", paths[:1])
+    text = benchmarks_page.current()
+    assert "Pace: frnet 2.00 steps per second (waited 20 s for its compilation).\n" in text
+    benchmarks_page.keep("one", paths)
+    assert "Pace: frnet 3.00 steps per second (waited 10 s for its compilation).\n" in benchmarks_page.current()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -19,12 +19,12 @@ def report(steps, still=0):
 
 def test_how_long_it_trained():
     assert health.training_note({"frnet": report(1), "extrassnet": report(250)}) == [
-        "Training: frnet 1 step in 45 s (compiled in 21 s); extrassnet 250 steps in 45 s (compiled in 21 s)."
+        "Training: frnet 1 step in 45 s (waited 21 s to be compiled); extrassnet 250 steps in 45 s (waited 21 s to be compiled)."
     ]
     assert health.training_note({}) == []
     validated = [{"step": step, "ess": psnr} for step, psnr in ((50, 22.0), (100, 22.126), (150, 22.1))]
     assert health.training_note({"frnet": {**report(150), "validated": validated}})[0].endswith(
-        "(compiled in 21 s), kept as it was at step 100, the best of 3 validations (ESS 22.13 dB)."
+        "(waited 21 s to be compiled), kept as it was at step 100, the best of 3 validations (ESS 22.13 dB)."
     )
 
 

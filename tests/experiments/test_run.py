@@ -63,6 +63,8 @@ def test_the_report_shows_every_method(finished):
     out, _, _ = finished
     page = (out / "report" / "index.html").read_text()
     assert all(name in page for name in ("extrass", "extrass-w", "extrass-e", "bilinear"))
+    for figure in ("frnet: loss", "frnet: validation, dB", "extrassnet: loss", "extrassnet: validation, dB"):
+        assert f"<figcaption>{figure}</figcaption>" in page
     assert list((out / "report" / "sheets").glob("*.png"))
 
 
@@ -71,7 +73,8 @@ def test_report_and_output_say_how_long_it_trained(finished):
     page, printed = (out / "report" / "index.html").read_text(), finished.printed
     for text in (page, printed):
         assert "Warning: frnet made only 2 steps: too few to learn much" in text
-        assert re.search(r"Training: frnet 2 steps in \d+ s \(compiled in \d+ s\); extrassnet 2 steps", text)
+        line = r"Training: frnet 2 steps in \d+ s \(waited \d+ s to be compiled\), kept as it was at step \d, "
+        assert re.search(line + r"the best of 2 validations \(ESS [\d.]+ dB\); extrassnet 2 steps", text)
     for phase in (
         "data: 100 % 3 sequences",
         "train frnet: compiling",
