@@ -19,7 +19,8 @@ def report(steps, still=0):
 
 def test_how_long_it_trained():
     assert health.training_note({"frnet": report(1), "extrassnet": report(250)}) == [
-        "Training: frnet 1 step in 45 s (waited 21 s to be compiled); extrassnet 250 steps in 45 s (waited 21 s to be compiled)."
+        "Training: frnet 1 step in 45 s (waited 21 s to be compiled); "
+        "extrassnet 250 steps in 45 s (waited 21 s to be compiled)."
     ]
     assert health.training_note({}) == []
     validated = [{"step": step, "ess": psnr} for step, psnr in ((50, 22.0), (100, 22.126), (150, 22.1))]
