@@ -16,7 +16,8 @@ class Config:
       train_frames, test_frames (also of validation), train_spp (also of validation), test_spp, mip_bias (thesis
       002: 0 for its dataset 1, -1 for its dataset 2), jitter ("halton", or "dlctus" where every frame is rendered).
     Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
-      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet). anneal (false:
+      learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet;
+      FASSET has none: first_width are RenderINR's neurons). anneal (false:
       no stage's learning rate decays), fresh (new train scenes after so many steps, rendered in the meantime;
       None: always those on disk), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
       of VGG-16 weights); average (decay of a moving average of the weights over the steps; None: the last weights) and

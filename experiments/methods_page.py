@@ -67,7 +67,7 @@ ENTRIES: dict[str, Entry] = {
     "fasset": Entry(
         "FASSET",
         "one recurrent gated U-Net for both kinds, its features decoded at any output size by an implicit MLP",
-        "widths, the recurrent module, what the hidden state is warped by",
+        "widths, the recurrent module, what it remembers (hidden state and last output) and how that is warped",
         "a hole",
     ),
     "extranet+nsrr": Entry(

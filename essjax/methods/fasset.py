@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from essjax import networks
-from essjax.color import expm1, log1p
+from essjax.cameras import pixel_positions
+from essjax.color import demodulate, expm1, log1p, modulate
 from essjax.frames import (
     Frame,
     GBuffers,
@@ -23,10 +24,34 @@ from essjax.frames import (
     surface_guides,
 )
 from essjax.interfaces import Method, MethodInfo, reset_at_cut
-from essjax.methods.rendered import GUIDED, Memory, advance, hole_buffers, push, reset_memory, start_memory
+from essjax.methods.rendered import (
+    GUIDED,
+    Memory,
+    Rendered,
+    advance,
+    albedo,
+    hole_buffers,
+    push,
+    reset_memory,
+    start_memory,
+)
 from essjax.methods.shots import within_shots
-from essjax.typing import Color, Image, Mask, Scalar, pytree
-from essjax.warp import backward_warp, fill_holes, hole_mask, jitter_aligned_upsample, jittered_motion
+from essjax.networks.fasset import LOCAL, PAST
+from essjax.typing import Array, Color, Image, Jitter, Mask, Scalar, pytree
+from essjax.warp import (
+    backward_warp,
+    dilate_motion,
+    fill_holes,
+    hole_mask,
+    inside_mask,
+    jitter_aligned_upsample,
+    jittered_motion,
+    sample,
+    upsample_motion,
+)
+
+SAMPLE_SIGMA = 0.65
+"""Of the Gaussian that tells RenderINR how near a sample is, output pixels."""
 
 
 @pytree
@@ -34,13 +59,15 @@ class Kept:
     """What is kept of a rendered frame.
 
     Attributes:
-      color: log1p, ``[..., H, W, 3]``.
-      hidden: the recurrent state after it, ``[..., H, W, width]``.
+      shading: demodulated colour, log1p, ``[..., H, W, 3]``.
+      hidden: the recurrent state after it, at pixel centres, ``[..., H, W, width]``.
+      image: the output, log1p, ``[..., round(scale H), round(scale W), 3]``.
       surfaces: the G-buffers that tell surfaces apart.
     """
 
-    color: Color
+    shading: Color
     hidden: Image
+    image: Color
     surfaces: GBuffers
 
 
@@ -60,30 +87,40 @@ class History:
 
 
 class Arrival(NamedTuple):
-    """What the history shows at a frame's samples.
+    """What the history shows at a frame's samples, and at its output pixels.
 
     Attributes:
-      color: of the last rendered frame, 0 in holes.
-      hidden: its recurrent state, 0 in holes.
+      shading: of the last rendered frame, at the samples, log1p.
+      hidden: its recurrent state, at pixel centres, 0 in holes.
       valid: 1 where the last rendered frame showed this surface, 0 in holes, ``[..., H, W, 1]``.
       recent: 1 where the last frame, rendered or not, did; 1 everywhere if there was none, and where the
         frame is reactive.
+      sampled: its output at the samples, log1p, 0 where there is none, ``[..., H, W, 3]``.
+      image: its output at this frame's, log1p, ``[..., round(scale H), round(scale W), 3]``.
+      known: 1 where there is one: not off screen, not reactive.
     """
 
-    color: Color
+    shading: Color
     hidden: Image
     valid: Mask
     recent: Mask
+    sampled: Color
+    image: Color
+    known: Mask
 
 
 def _surfaces(gbuffers: GBuffers) -> GBuffers:
     return jax.tree.map(jnp.copy, hole_buffers(gbuffers))  # streaming donates the history, not the frame
 
 
-def _start(example: Frame, width: int) -> History:
-    size = example.motion.shape[:-1]
-    color, hidden = (jnp.zeros((*size, channels), jnp.float32) for channels in (3, width))
-    kept = Kept(color=color, hidden=hidden, surfaces=_surfaces(example.gbuffers))
+def _start(example: Frame, scale: float, width: int) -> History:
+    *lead, height, low_width, _ = example.motion.shape
+
+    def zeros(scale: float, channels: int) -> Array:
+        return jnp.zeros((*lead, round(scale * height), round(scale * low_width), channels), jnp.float32)
+
+    surfaces = _surfaces(example.gbuffers)
+    kept = Kept(shading=zeros(1, 3), hidden=zeros(1, width), image=zeros(scale, 3), surfaces=surfaces)
     return History(
         rendered=start_memory(example, kept, 1),
         surfaces=_surfaces(example.gbuffers),
@@ -91,9 +128,9 @@ def _start(example: Frame, width: int) -> History:
     )
 
 
-def _arrive(history: History, frame: Frame, width: int) -> tuple[History, Arrival]:
+def _arrive(history: History, frame: Frame, scale: float, width: int) -> tuple[History, Arrival]:
     """The history with its path extended to ``frame``, and what it shows there."""
-    fresh, before = _start(frame, width), history.rendered
+    fresh, before = _start(frame, scale, width), history.rendered
     before = reset_memory(frame.cut, fresh.rendered, before)
     surfaces = reset_at_cut(frame.cut, fresh.surfaces, history.surfaces)
     unit = reset_at_cut(frame.cut, fresh.depth_scale, history.depth_scale)
@@ -105,16 +142,65 @@ def _arrive(history: History, frame: Frame, width: int) -> tuple[History, Arriva
         frame.gbuffers, last.content.surfaces, last.motion, jitter=frame.jitter, jitter_previous=last.jitter
     )
     valid = jnp.where(empty, 0.0, same * last.valid)
-    recent = jnp.where(empty, 1.0, recent)
+    recent, trust = jnp.where(empty, 1.0, recent), jnp.where(empty, 0.0, jnp.ones_like(valid))
     if frame.reactive is not None and last.trust is not None:
-        valid = valid * last.trust
+        valid, trust = valid * last.trust, trust * last.trust
         # What a reactive pixel shows is its own sample: nothing is cut out of it.
         recent = jnp.maximum(recent, frame.reactive)
-    lookup = jax.lax.stop_gradient(jittered_motion(last.motion, frame.jitter, last.jitter))
-    both = jnp.concatenate([jax.lax.stop_gradient(last.content.color), last.content.hidden], axis=-1)
-    warped = valid * backward_warp(both, lookup)
     history = History(rendered=memory, surfaces=_surfaces(frame.gbuffers), depth_scale=unit)
-    return history, Arrival(warped[..., :3], warped[..., 3:], valid, recent)
+    return history, Arrival(valid=valid, recent=recent, **_read(last, frame, scale, valid, trust))
+
+
+def _read(last: Rendered, frame: Frame, scale: float, valid: Mask, trust: Mask) -> dict[str, Array]:
+    """What was kept, each on its own grid: shading at samples, hidden state at pixel centres, the image at output size.
+
+    Held on unjittered grids, what is written in one frame is read in another as it was; from samples to samples it
+    would be blurred by each new jitter.
+    """
+    height, low_width = frame.motion.shape[-3:-1]
+    kept, motion = last.content, jax.lax.stop_gradient(last.motion)
+    shading = backward_warp(jax.lax.stop_gradient(kept.shading), jittered_motion(motion, frame.jitter, last.jitter))
+    hidden = backward_warp(kept.hidden, upsample_motion(motion, 1, jitter=frame.jitter))
+    samples = pixel_positions(height, low_width, frame.jitter) + motion
+    # Dilated, so that the history of a silhouette moves with the surface in front.
+    at_output = upsample_motion(dilate_motion(motion, frame.gbuffers.depth), scale, jitter=frame.jitter)
+    known = inside_mask(at_output) * jitter_aligned_upsample(trust, scale, frame.jitter, mode="nearest")
+    return {
+        "shading": shading,
+        "hidden": _as_far_as(valid, hidden),
+        "sampled": _as_far_as(inside_mask(motion) * trust, sample(kept.image, scale * samples)),
+        # Bicubic: bilinear would blur the history a little more with every frame.
+        "image": backward_warp(kept.image, at_output, mode="bicubic"),
+        "known": known,
+    }
+
+
+def _as_far_as(mask: Mask, image: Image) -> Image:
+    """``mask * image``; where it is 0 nothing is left, not even NaN."""
+    return jnp.where(mask > 0, mask * image, 0.0)
+
+
+def sample_nearness(height: int, width: int, scale: float, jitter: Jitter) -> Mask:
+    """How near each output pixel is to the nearest sample, a Gaussian of ``SAMPLE_SIGMA`` output pixels: (0, 1].
+
+    Args:
+      height: of the input.
+      width: of the input.
+      scale: output size over input size.
+      jitter: ``[..., 2]`` LR pixels.
+
+    Returns:
+      ``[..., round(scale H), round(scale W), 1]``.
+    """
+
+    def along(size: int, jitter: Array) -> Array:
+        """Squared distance in output pixels, ``[..., round(scale * size)]``."""
+        position = (jnp.arange(round(scale * size), dtype=jnp.float32) + 0.5) / scale - jitter[..., None]
+        nearest = jnp.clip(jnp.floor(position), 0, size - 1) + 0.5
+        return (scale * (position - nearest)) ** 2
+
+    distance = along(height, jitter[..., 1])[..., :, None] + along(width, jitter[..., 0])[..., None, :]
+    return jnp.exp(-0.5 * distance / SAMPLE_SIGMA**2)[..., None]
 
 
 def fasset(
@@ -129,20 +215,21 @@ def fasset(
     """FASSET: ``variables = {"fasset": ...}``, ``aux`` holds ``log_image``, ``mask`` and ``valid``.
 
     A rendered frame is not warped, but the holes of the warped previous frame are cut out of it, so that both tasks
-    look alike and in-painting is learned from both. The output is RenderINR's plus the upsampled input, whose holes
-    are filled smoothly; output pixel P reads at (P + 0.5) / scale - jitter. The hidden state is updated by rendered
-    frames, follows the motion and is 0 in holes.
+    look alike and in-painting is learned from both. The output is RenderINR's colour plus a base, moved towards the
+    last rendered frame's output by a share that RenderINR says (0 before training). The base is the input upsampled:
+    warped and filled smoothly without its texture, given that of the current frame; output pixel P reads at
+    (P + 0.5) / scale - jitter. The hidden state is updated by rendered frames, follows the motion and is 0 in holes.
 
     Args:
       scale: output size over input size, any positive number; output sizes are rounded.
-      width: channels of each of the two feature maps.
+      width: of the encoders; each of the two feature maps has 3 channels fewer.
       hidden: neurons of RenderINR's layers; None: 16/3 of the width, 128 at 24.
       gencoder: False feeds RenderINR the G-buffers themselves (Table 4, "- GEncoder").
       mask_rendered: False leaves rendered frames whole (Table 4, "- Additional mask").
       shared: False gives each task a FrameEncoder of its own (Table 4, "- Shared weights").
 
     Raises:
-      ValueError: the scale is not positive.
+      ValueError: the scale is not positive, or the width is below 4.
     """
     if not scale > 0:
         raise ValueError(f"scale: expected a positive number, got {scale!r}.")
@@ -152,38 +239,54 @@ def fasset(
     name = "-".join(["fasset", *(part for part, absent in removed.items() if absent)])
 
     def start(example):
-        return _start(example, width)
+        return _start(example, scale, width)
 
     def init(key, example):
         require(example, sorted(GUIDED), name)
-        history, size = start(example), example.motion.shape[:-1]
-        color, mask, hidden = (jnp.zeros((*size, channels), jnp.float32) for channels in (3, 1, width))
-        inputs = color, mask, _guides(history, example), hidden
-        return {"fasset": network.init(key, *inputs, example.jitter)}
+        *lead, height, low_width, _ = example.motion.shape
+        large = (*lead, round(scale * height), round(scale * low_width), LOCAL)
+        low = [(*lead, height, low_width, channels) for channels in (3, 1, 7, PAST, width)]
+        shapes = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in (*low, large, example.jitter.shape)]
+        return {"fasset": network.init(key, *shapes)}
 
-    def predict(variables, history, frame, color, mask, hidden, train, task):
-        """The output as log1p and the new hidden state, from a frame whose holes are 0."""
-        inputs = color, mask, _guides(history, frame), hidden, frame.jitter
-        (residual, hidden), _ = network.apply(variables["fasset"], *inputs, train=train, method=task)
-        base = jitter_aligned_upsample(fill_holes(color, mask), scale, frame.jitter)
-        return jax.lax.stop_gradient(base) + residual, hidden
+    def predict(variables, history, frame, shading, mask, arrival, near, train, task):
+        """The output as log1p, the new hidden state and statistics; ``shading`` (log1p) is not read in holes."""
+        texture = albedo(frame.gbuffers)
+        filled = log1p(modulate(expm1(fill_holes(shading, mask)), texture))
+        base = jax.lax.stop_gradient(jitter_aligned_upsample(filled, scale, frame.jitter))
+        difference = _as_far_as(arrival.known, arrival.image - base)
+        trusted = jitter_aligned_upsample(arrival.valid, scale, frame.jitter, mode="nearest")
+        inputs = (
+            mask * filled,
+            mask,
+            _guides(history, frame),
+            jnp.concatenate([arrival.sampled, arrival.valid], axis=-1),
+            arrival.hidden,
+            jnp.concatenate([difference, trusted, near], axis=-1),
+            frame.jitter,
+        )
+        (color, share, hidden), state = network.apply(variables["fasset"], *inputs, train=train, method=task)
+        return base + share * difference + color, hidden, {"fasset": state} if state else {}
 
     def render_step(variables, history, frame, *, train=False):
-        color = log1p(rendered_color(frame, name))
-        history, arrival = _arrive(history, frame, width)
+        shading = log1p(demodulate(rendered_color(frame, name), albedo(frame.gbuffers)))
+        history, arrival = _arrive(history, frame, scale, width)
         mask = arrival.recent if mask_rendered else jnp.ones_like(arrival.recent)
-        visible = jnp.where(mask > 0, color, 0.0)
-        log_image, hidden = predict(variables, history, frame, visible, mask, arrival.hidden, train, "render")
-        kept = Kept(color=color, hidden=hidden, surfaces=_surfaces(frame.gbuffers))
+        near = sample_nearness(*shading.shape[-3:-1], scale, frame.jitter)
+        log_image, hidden, state = predict(variables, history, frame, shading, mask, arrival, near, train, "render")
+        image = jnp.maximum(log_image, 0.0)  # as it is shown
+        kept = Kept(shading=shading, hidden=hidden, image=image, surfaces=_surfaces(frame.gbuffers))
         history = dataclasses.replace(history, rendered=push(history.rendered, frame, kept))
         aux = {"log_image": log_image, "mask": mask, "valid": arrival.recent}
-        return history, Prediction(image=expm1(log_image), aux=aux)
+        return history, Prediction(image=expm1(log_image), aux=aux, state=state)
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history, arrival = _arrive(history, frame, width)
-        color, hidden, mask, _ = arrival
-        log_image, _ = predict(variables, history, frame, color, mask, hidden, train, "extrapolate")
-        return history, Prediction(image=expm1(log_image), aux={"log_image": log_image, "mask": mask, "valid": mask})
+        history, arrival = _arrive(history, frame, scale, width)
+        mask, nowhere = arrival.valid, jnp.zeros_like(arrival.known)
+        given = arrival.shading, mask, arrival, nowhere
+        log_image, _, state = predict(variables, history, frame, *given, train, "extrapolate")
+        aux = {"log_image": log_image, "mask": mask, "valid": mask}
+        return history, Prediction(image=expm1(log_image), aux=aux, state=state)
 
     info = MethodInfo(name, scale=scale, requires=GUIDED)
     return within_shots(Method(init, start, render_step, extrapolate_step, info))

@@ -12,14 +12,16 @@ from essjax import scenes
 from essjax.color import log1p
 from essjax.frames import GBuffers, select_time
 from essjax.methods import fasset, gaussian_blur
+from essjax.methods.fasset import sample_nearness
+from essjax.methods.rendered import albedo
 from essjax.networks.fasset import OUTPUT_GAIN
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
 from essjax.scenes.render import render_reference
-from essjax.warp import hole_mask
+from essjax.warp import hole_mask, jitter_aligned_upsample
 from tests.helpers import make_frames, random_image
 
 T, B, H, W = 4, 2, 30, 40
-TINY = {"width": 3, "hidden": 5}
+TINY = {"width": 4, "hidden": 5}
 FAST = {"xla_backend_optimization_level": 0}
 """Compiles in half the time."""
 METHOD = fasset(scale=1.5, **TINY)
@@ -41,9 +43,15 @@ def busy():
     """Variables none of which is zero: every layer has its say. Made without compiling ``init``."""
     shapes = jax.eval_shape(METHOD.init, jax.random.key(0), select_time(random_frames(), 0))
     rng = np.random.default_rng(0)
-    variables = jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.normal(size=leaf.shape), jnp.float32), shapes)
+
+    def draw(path, leaf):
+        noise = jnp.asarray(0.3 * rng.normal(size=leaf.shape), jnp.float32)
+        return 1.0 + jnp.abs(noise) if path[-1].key == "var" else noise
+
+    variables = jax.tree_util.tree_map_with_path(draw, shapes)
     last = variables["fasset"]["params"]["inr"]["Dense_3"]
-    last.update({name: value / OUTPUT_GAIN for name, value in last.items()})
+    gain = jnp.array([1.0] + [1.0 / OUTPUT_GAIN] * 3)
+    last.update({name: value * gain for name, value in last.items()})
     return variables
 
 
@@ -275,6 +283,86 @@ def test_the_hidden_state_follows_the_motion(busy, kinds):
     assert np.abs(np.asarray(hidden_state(alone))[:, 9:-9, 9:-9] - states[0]).max() > 1e-3  # it has a memory at all
 
 
+def without_motion(frames, **changes):
+    """One flat surface that stands still, seen at each frame's own jitter."""
+    gbuffers = GBuffers(
+        base_color=frames.gbuffers.base_color,
+        normal=jnp.zeros_like(frames.gbuffers.normal),
+        depth=jnp.full_like(frames.gbuffers.depth, 5.0),
+    )
+    return dataclasses.replace(frames, gbuffers=gbuffers, motion=jnp.zeros_like(frames.motion), **changes)
+
+
+def with_layer(variables, path, **leaves):
+    """A copy of the variables whose layer ``path`` has other leaves."""
+    variables = jax.tree.map(jnp.copy, variables)
+    layer = variables["fasset"]["params"]
+    for name in path:
+        layer = layer[name]
+    layer.update({name: jnp.full_like(layer[name], value) for name, value in leaves.items()})
+    return variables
+
+
+def test_a_hidden_state_that_is_kept_does_not_see_the_jitter(busy):
+    """Update gates closed: over any number of jitters the state stays what it was, where samples were it would blur."""
+    frames = without_motion(random_frames(11))
+    closed = with_layer(busy, ("frame_encoder", "ConvGRU_0", "Conv_0"), kernel=0.0, bias=-60.0)
+    history = after_first(closed, frames)
+    state = random_image(12, B, H, W, TINY["width"]) - 0.5
+    rendered = history.inner.rendered
+    kept = rendered.frames
+    kept = dataclasses.replace(kept, content=dataclasses.replace(kept.content, hidden=state[None]))
+    inner = dataclasses.replace(history.inner, rendered=dataclasses.replace(rendered, frames=kept))
+    history = dataclasses.replace(history, inner=inner)
+    for n, kind in ((1, ESS), (2, SS), (3, SS)):
+        history, _ = streaming()[kind](closed, history, select_time(frames, n))
+    inside = (slice(None), slice(1, -1), slice(1, -1))  # the border's samples may lie off screen
+    np.testing.assert_allclose(hidden_state(history)[inside], state[inside], atol=1e-5)
+
+
+def test_history_is_read_at_output_size(untrained):
+    """Share 1: every output is the first one, to the last pixel, whatever the jitter."""
+    frames = without_motion(random_frames(13))
+    share = jnp.array([40.0, 0.0, 0.0, 0.0])
+    all_of_it = jax.tree.map(jnp.copy, untrained)
+    all_of_it["fasset"]["params"]["inr"]["Dense_3"]["bias"] = share
+    images = stream(METHOD, all_of_it, frames, (SS, ESS, SS, ESS))
+    for image in images[1:]:
+        np.testing.assert_allclose(image, images[0], rtol=1e-4, atol=1e-4)
+    assert float(jnp.abs(stream(METHOD, untrained, frames, (SS, SS))[1] - images[0]).max()) > 0.1
+
+
+@pytest.mark.parametrize("kind", [SS, ESS])
+def test_texture_is_that_of_the_current_frame(untrained, kind):
+    """Light of one colour on changing textures: warped and filled without them, it is exact, in holes as well."""
+    frames = random_frames(15)
+    light = jnp.array([0.9, 0.6, 0.3])
+    color = light * albedo(frames.gbuffers)
+    sky = ~jnp.isfinite(frames.gbuffers.depth)
+    gbuffers = dataclasses.replace(frames.gbuffers, depth=jnp.where(sky, 5.1, frames.gbuffers.depth))
+    frames = dataclasses.replace(frames, color=jnp.where(sky, light * albedo(gbuffers), color), gbuffers=gbuffers)
+    second = select_time(frames, 1)
+    image = stream(METHOD, untrained, frames, (SS, kind))[1]
+    expected = jitter_aligned_upsample(log1p(second.color), 1.5, second.jitter)
+    np.testing.assert_allclose(log1p(image), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_nearness_of_samples():
+    near = jax.jit(lambda jitter: sample_nearness(3, 2, 2, jitter))(jnp.array([0.25, -0.4]))
+    assert near.shape == (6, 4, 1)
+    # Samples at x 1.5, 3.5 (output pixels: 0.5 + 0.25 times 2), y 0.2, 2.2, 4.2; output centres at 0.5, 1.5 ...
+    x, y = np.array([-1.0, 0.0, -1.0, 0.0]), np.array([0.3, -0.7, 0.3, -0.7, 0.3, 1.3])
+    expected = np.exp(-0.5 * (x[None] ** 2 + y[:, None] ** 2) / 0.65**2)
+    np.testing.assert_allclose(near[..., 0], expected, rtol=1e-4)
+
+
+def test_training_returns_statistics(busy):
+    frames = random_frames(16)
+    run = lambda variables, frames: unroll(METHOD, variables, frames, alternate(0), train=True).state  # noqa: E731
+    state = jax.eval_shape(run, busy, frames)
+    assert jax.tree.structure(state["fasset"]["batch_stats"]) == jax.tree.structure(busy["fasset"]["batch_stats"])
+
+
 def test_frame_without_colour():
     bare = dataclasses.replace(select_time(random_frames(), 0), color=None)
     variables = jax.eval_shape(METHOD.init, jax.random.key(0), bare)
@@ -287,6 +375,8 @@ def test_frame_without_colour():
 def test_errors_say_what_to_do():
     with pytest.raises(ValueError, match="scale: expected a positive number, got 0"):
         fasset(scale=0)
+    with pytest.raises(ValueError, match="FASSET's width: expected at least 4 .*, got 3"):
+        fasset(width=3)
     frame = select_time(random_frames(), 0)
     bare = dataclasses.replace(frame, gbuffers=GBuffers(depth=frame.gbuffers.depth))
     with pytest.raises(ValueError, match="fasset needs the buffers base_color, normal, which these frames do not have"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from essjax.networks import fasset
-from essjax.networks.fasset import OUTPUT_GAIN, RenderINR, Reweighting
+from essjax.networks.fasset import LOCAL, MAX_WEIGHT, OUTPUT_GAIN, PAST, RenderINR, Reweighting
 from tests.helpers import random_image
 
 
@@ -19,17 +19,28 @@ def parameters(variables):
 
 def noisy(variables, seed=0, scale=0.3):
     rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda leaf: leaf + jnp.asarray(scale * rng.normal(size=leaf.shape), jnp.float32), variables)
+    noise = lambda leaf: jnp.asarray(scale * rng.normal(size=leaf.shape), jnp.float32)  # noqa: E731
+
+    def add(path, leaf):  # variances stay positive
+        return leaf + (jnp.abs(noise(leaf)) if path[-1].key == "var" else noise(leaf))
+
+    return jax.tree_util.tree_map_with_path(add, variables)
 
 
-def inputs(B, H, W, width):
-    """Frame, mask, G-buffers, hidden state, jitter."""
-    return *(random_image(k, B, H, W, c) for k, c in enumerate((3, 1, 7, width))), random_image(9, B, 2) - 0.5
+def inputs(B, H, W, width, scale=1.5):
+    """Frame, mask, G-buffers, history at the samples, hidden state, what is known of output pixels, jitter."""
+    low = [random_image(k, B, H, W, c) for k, c in enumerate((3, 1, 7, PAST, width))]
+    return *low, random_image(8, B, round(scale * H), round(scale * W), LOCAL), random_image(9, B, 2) - 0.5
 
 
 @functools.cache
+def variables(**settings):
+    given = inputs(1, 8, 8, 24, settings.get("scale", 2))
+    return jax.eval_shape(fasset(**settings).init, jax.random.key(0), *given)
+
+
 def shapes(**settings):
-    return jax.eval_shape(fasset(**settings).init, jax.random.key(0), *inputs(1, 8, 8, 24))["params"]
+    return variables(**settings)["params"]
 
 
 def test_sizes_are_the_papers():
@@ -39,12 +50,16 @@ def test_sizes_are_the_papers():
     first = shapes()["inr"]["Dense_0"]["kernel"].shape
     assert first[0] <= 48 and first[1] == 128 and len(shapes()["inr"]) == 5  # 3 hidden, output, pixel size
     assert shapes(scale=3.3) == shapes()  # any size with the same weights
+    gated = [name for name in shapes()["frame_encoder"] if name.startswith("GatedConv")]
+    assert len(gated) == 7 and all(
+        set(variables()["batch_stats"]["frame_encoder"][n]["BatchNorm_0"]) == {"mean", "var"} for n in gated
+    )
 
 
 def test_ablations_differ_in_their_part_only():
     without = shapes(gencoder=False)
     assert set(shapes()) - set(without) == {"gbuffer_encoder"}
-    assert without["inr"]["Dense_0"]["kernel"].shape[0] == 24 + 7
+    assert without["inr"]["Dense_0"]["kernel"].shape[0] == 21 + 7 + LOCAL
     separate = shapes(shared=False)
     assert parameters(separate) - parameters(shapes()) == parameters(shapes()["frame_encoder"])
 
@@ -57,45 +72,60 @@ def test_render_inr_equals_numpy():
     x = np.concatenate([latents, np.full((2, 3, 5, 1), 0.4)], axis=-1) @ stacked + layers["Dense_0"]["bias"]
     for name in ("Dense_1", "Dense_2", "Dense_3"):
         x = np.maximum(x, 0) @ layers[name]["kernel"] + layers[name]["bias"]
-    np.testing.assert_allclose(10 * module.apply(variables, latents, jnp.full(1, 0.4)), x, rtol=1e-4, atol=1e-5)
+    color, share = module.apply(variables, latents, jnp.full(1, 0.4))
+    np.testing.assert_allclose(share, np.tanh(x[..., :1]), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(color / OUTPUT_GAIN, x[..., 1:], rtol=1e-4, atol=1e-5)
 
 
-def test_feature_weights_start_at_one_and_stay_between_zero_and_ten():
+def test_feature_weights_start_in_the_middle_of_their_range():
+    """At 1, where tanh is steepest; at a tenth of (0, 10) it had lost two thirds of its gradient and soon the rest."""
     module, image = Reweighting(4), random_image(2, 2, 5, 7, 10)
     variables = module.init(jax.random.key(0), image[..., :3], image[..., 3:])
     apply = jax.jit(module.apply)
     for weight in apply(variables, image[..., :3], image[..., 3:]):
+        np.testing.assert_allclose(weight, MAX_WEIGHT / 2, rtol=1e-5)
         np.testing.assert_allclose(weight, 1.0, rtol=1e-5)
     first, second = apply(noisy(jax.tree.map(jnp.zeros_like, variables), 1, 0.2), image[..., :3], image[..., 3:])
     for weight in (first, second):
-        assert weight.shape == (2, 5, 7, 1) and 0 <= float(weight.min()) <= float(weight.max()) <= 10
+        assert weight.shape == (2, 5, 7, 1) and 0 <= float(weight.min()) <= float(weight.max()) <= MAX_WEIGHT
         assert float(weight.max() - weight.min()) > 0.1
     assert float(jnp.abs(first - second).max()) > 0.1
 
 
 @pytest.fixture(scope="module")
 def tiny():
-    network = fasset(1.5, width=3, hidden=5, shared=False)
-    variables = network.init(jax.random.key(0), *inputs(2, 9, 14, 3))
+    network = fasset(1.5, width=4, hidden=5, shared=False)
+    variables = network.init(jax.random.key(0), *inputs(2, 9, 14, 4))
     run = {m: jax.jit(lambda v, *x, m=m: network.apply(v, *x, method=m)[0]) for m in ("render", "extrapolate")}
     return run, variables
 
 
 def test_odd_sizes_and_untrained_output(tiny):
     run, variables = tiny
-    residual, hidden = run["render"](variables, *inputs(2, 9, 14, 3))
-    assert residual.shape == (2, 14, 21, 3) and hidden.shape == (2, 9, 14, 3)  # 13.5 rounds to even
-    np.testing.assert_array_equal(residual, 0.0)
+    color, share, hidden = run["render"](variables, *inputs(2, 9, 14, 4))
+    assert color.shape == (2, 14, 21, 3) and hidden.shape == (2, 9, 14, 4)  # 13.5 rounds to even
+    np.testing.assert_array_equal(share, jnp.zeros((2, 14, 21, 1)))
+    np.testing.assert_array_equal(color, 0.0)
 
 
 def test_every_input_and_every_task_has_its_say(tiny):
     run, variables = tiny
-    variables, given = noisy(variables, 2), inputs(2, 9, 14, 3)
+    variables, given = noisy(variables, 2), inputs(2, 9, 14, 4)
     outputs = {task: run[task](variables, *given)[0] for task in run}
     assert float(jnp.abs(outputs["render"] - outputs["extrapolate"]).max()) > 1e-3  # two encoders
     for k in range(len(given)):
         changed = [x[::-1] if n == k else x for n, x in enumerate(given)]
-        assert float(jnp.abs(run["render"](variables, *changed)[0] - outputs["render"]).max()) > 1e-4
+        assert float(jnp.abs(run["render"](variables, *changed)[0] - outputs["render"]).max()) > 1e-4, k
+
+
+def test_statistics_are_the_batchs_in_training():
+    network, given = fasset(1.5, width=4, hidden=5), inputs(2, 9, 14, 4)
+    variables = jax.tree.map(jnp.ones_like, jax.eval_shape(network.init, jax.random.key(0), *given))
+    apply = lambda v, *x: network.apply(v, *x, train=True, method="extrapolate")[1]  # noqa: E731
+    state = jax.jit(apply)(variables, *given)["batch_stats"]
+    assert jax.tree.structure(state) == jax.tree.structure(variables["batch_stats"])
+    moved = [float(jnp.abs(leaf - 1.0).max()) for leaf in jax.tree.leaves(state)]
+    assert min(moved) > 1e-3
 
 
 # Scale, jitter, first and step of output pixels that read at centres of LR pixels, first and step of the latter.
@@ -108,7 +138,7 @@ ALIGNED = [
 
 @functools.cache
 def outputs_at(scale):
-    network = fasset(scale, width=3, hidden=5)
+    network = fasset(scale, width=4, hidden=5)
     return jax.jit(lambda variables, *x: network.apply(variables, *x, method="render")[0][0])
 
 
@@ -116,13 +146,17 @@ def outputs_at(scale):
 def test_latents_are_read_where_the_samples_lie(tiny, scale, jitter, first, step, low_first, low_step):
     """With any weights: output pixels that fall on samples are those of scale 1, where every pixel does."""
     variables = noisy(tiny[1], 3)
-    del variables["params"]["frame_encoder_ess"]
+    del variables["params"]["frame_encoder_ess"], variables["batch_stats"]["frame_encoder_ess"]
     pixel_size = variables["params"]["inr"]["pixel_size"]["kernel"]
-    *given, _ = inputs(2, 13, 18, 3)
+    first_layer = variables["params"]["frame_encoder"]["GatedConv_0"]["Conv_0"]
+    # The encoder is told the jitter, which differs here between what is compared.
+    first_layer["kernel"] = first_layer["kernel"].at[:, :, -2:].set(0.0)
+    *given, local, _ = inputs(2, 13, 18, 4)
 
     def run(scale, jitter, kernel):
         variables["params"]["inr"]["pixel_size"]["kernel"] = kernel
-        return np.asarray(outputs_at(scale)(variables, *given, jnp.full((2, 2), jitter))) / OUTPUT_GAIN
+        known = jnp.broadcast_to(local[:, :1, :1], (2, round(scale * 13), round(scale * 18), LOCAL))
+        return np.asarray(outputs_at(scale)(variables, *given, known, jnp.full((2, 2), jitter))) / OUTPUT_GAIN
 
     low = run(1, 0.0, pixel_size / scale)[:, low_first::low_step, low_first::low_step]
     high = run(scale, jitter, pixel_size)[:, first::step, first::step]

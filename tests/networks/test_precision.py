@@ -6,6 +6,7 @@ import pytest
 from essjax.networks import compute_dtype, extranet, fasset
 from essjax.networks.blocks import conv
 from essjax.networks.extranet import input_shapes
+from essjax.networks.fasset import LOCAL, PAST
 
 
 def _random(shapes, seed=0):
@@ -58,7 +59,7 @@ def test_a_network_stays_close_to_float32(dtype):
 
 def test_pixelwise_layers_follow():
     network = fasset(scale=1.5, width=8, hidden=8)
-    shapes = [(1, 8, 12, n) for n in (3, 1, 7, 8)] + [(1, 2)]
+    shapes = [*((1, 8, 12, n) for n in (3, 1, 7, PAST, 8)), (1, 12, 18, LOCAL), (1, 2)]
     inputs = _random([jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes])
     variables = network.init(jax.random.key(3), *inputs)
 

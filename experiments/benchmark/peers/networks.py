@@ -236,7 +236,7 @@ def fasset(p: Weights, scale: float = 2) -> Callable:
         for level, numbers in enumerate((range(3), range(3, 5), range(5, 7))):
             x = F.avg_pool2d(x, 2) if level else x
             for n in numbers:
-                x = F.relu(2 * gated(x, p[f"GatedConv_{n}"]))
+                x = gated(x, p[f"GatedConv_{n}"])
             x = x if level else recurrent(hidden, x, p["ConvGRU_0"])
             features.append(x)
         return decode(features, p["Decoder_0"])
@@ -252,19 +252,21 @@ def fasset(p: Weights, scale: float = 2) -> Callable:
         grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)[None]
         return F.grid_sample(x, grid, mode="bilinear", padding_mode="border", align_corners=False)
 
-    def forward(frame, mask, gbuffers, hidden, jitter):
+    def forward(frame, mask, gbuffers, past, hidden, local, jitter):
         height, width = mask.shape[-2:]
-        inputs = torch.cat([frame, mask, gbuffers[:, 3:]], dim=1)
+        where = jitter[:, :2, :1, :1].expand(-1, -1, height, width)
+        inputs = torch.cat([frame, mask, gbuffers[:, 3:], past, where], dim=1)
         features = encode(pad_to(inputs, 4), pad_to(hidden, 4), p["frame_encoder"])[..., :height, :width]
         surface = conv(chain(gbuffers, p["gbuffer_encoder"]["Chain_0"]), p["gbuffer_encoder"]["Conv_0"])
         weights = p["reweighting"]
         weights = conv(chain(torch.cat([frame, gbuffers], dim=1), weights["Chain_0"]), weights["Conv_0"])
         weights = MAX_WEIGHT / 2 * (1 + torch.tanh(weights))
         latents = queried(torch.cat([weights[:, :1] * features, weights[:, 1:] * surface], dim=1), jitter)
-        x, inr = latents.permute(0, 2, 3, 1), p["inr"]
+        x, inr = torch.cat([latents, local], dim=1).permute(0, 2, 3, 1), p["inr"]
         x = dense(x, inr["Dense_0"]) + inr["pixel_size"]["kernel"][0] / scale
         x = dense(F.relu(dense(F.relu(x), inr["Dense_1"])), inr["Dense_2"])
-        return (OUTPUT_GAIN * dense(F.relu(x), inr["Dense_3"])).permute(0, 3, 1, 2)
+        output = dense(F.relu(x), inr["Dense_3"]).permute(0, 3, 1, 2)
+        return OUTPUT_GAIN * output[:, 1:], torch.tanh(output[:, :1])
 
     return forward
 

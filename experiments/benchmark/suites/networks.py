@@ -12,6 +12,7 @@ from essjax.deploy import count_parameters
 from essjax.interfaces import Network
 from essjax.networks import compute_dtype
 from essjax.networks.extranet import input_shapes
+from essjax.networks.fasset import LOCAL, PAST
 from essjax.networks.nsrr import FEATURES, PREVIOUS
 from experiments.benchmark import inputs, peers
 from experiments.benchmark.measure import Case, measure
@@ -52,7 +53,7 @@ def forwards(width: int, height: int) -> list[Forward]:
     native = {"height": height * 4 // 3, "width": width * 4 // 3}
     names = {"low": f"{width}x{height}", "high": f"{2 * width}x{2 * height}"}
     extrass = _shape(*low, 31), _shape(*low, 37)
-    fasset = (*(_shape(*low, n) for n in (3, 1, 7, 24)), _shape(1, 2))
+    fasset = (*(_shape(*low, n) for n in (3, 1, 7, PAST, 24)), _shape(*high, LOCAL), _shape(1, 2))
     features = _shape(*low, 4), _shape(*high, FEATURES), _shape(PREVIOUS, *high, FEATURES)
     frnet = _shape(2, *half, 3), _shape(*half, 1)
     ifrnet = _shape(2, *low, 3), _shape(2, 1, 2)
