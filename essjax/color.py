@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from essjax.typing import Array, Color, Image, Plane
+from essjax.typing import Array, Color, Image, Plane, Scalar
 
 ALBEDO_FLOOR = 0.04
 """Smallest divisor of a demodulation: below it noise in dark materials would be amplified."""
@@ -37,9 +37,17 @@ def modulate(shading: Color, albedo: Color) -> Color:
     return shading * albedo
 
 
+def expose(radiance: Image, exposure: Scalar) -> Image:
+    """Scene radiance ``[..., H, W, C]`` times its frame's exposure ``[...]``: what the transfer functions below take.
+
+    The unit of radiance is gone after it. Divide by the exposure with ``expose(exposed, 1 / exposure)``.
+    """
+    return radiance * exposure[..., None, None, None]
+
+
 @jax.custom_vjp
 def log1p(color: Image) -> Image:
-    """log(1 + x) of radiance: what networks see. Negative input counts as 0, and there, as at 0, the gradient is 0.
+    """log(1 + x) of exposed colour: what networks see. Negative input counts as 0; there and at 0 the gradient is 0.
 
     The gradient is computed from the output, exp(-y): what made the input (a bicubic read, say) can then be fused with
     the logarithm instead of being stored for the backward pass. Differentiates in reverse mode only.

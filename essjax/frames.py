@@ -57,7 +57,8 @@ class Frame:
         stored at the jittered sample positions.
       jitter: ``[..., 2]`` (x, y) pixels of this resolution in [-0.5, 0.5): the sample lies at pixel centre + jitter.
       cut: bool ``[...]``: true where history is not valid (first frame of a shot).
-      exposure: ``[...]`` positive; colour is scene radiance whatever its value.
+      exposure: ``[...]`` positive, what colour is multiplied with before it is shown; colour is scene radiance whatever
+        its value. None: not recorded, methods meter it (``essjax.exposure``).
       camera: in pixels of this resolution, or None.
       reactive: ``[..., H, W, 1]`` in [0, 1], 1 = do not trust history here; or None.
     """
@@ -67,7 +68,7 @@ class Frame:
     motion: Motion
     jitter: Jitter
     cut: Flag
-    exposure: Scalar
+    exposure: Scalar | None = None
     camera: Camera | None = None
     reactive: Plane | None = None
 
@@ -225,7 +226,9 @@ def check_shapes(frame: Frame, where: str = "frame") -> None:
     if frame.jitter.shape[-1:] != (2,):
         raise ValueError(f"{where}, jitter: expected [..., 2] (x, y) in pixels, got {tuple(frame.jitter.shape)}.")
     cores = {f"channel {name}": (image, 3) for name, image in frame_images(frame).items()}
-    cores |= {"jitter": (frame.jitter, 1), "cut": (frame.cut, 0), "exposure": (frame.exposure, 0)}
+    cores |= {"jitter": (frame.jitter, 1), "cut": (frame.cut, 0)}
+    if frame.exposure is not None:
+        cores |= {"exposure": (frame.exposure, 0)}
     if frame.camera is not None:
         camera = frame.camera
         cores |= {"camera.camera_to_world": (camera.camera_to_world, 2)}
@@ -244,7 +247,9 @@ def check_dtypes(frame: Frame, where: str = "frame") -> None:
 
     Methods keep what they are given in their histories, whose types must not change from frame to frame.
     """
-    arrays = frame_images(frame) | {"jitter": frame.jitter, "exposure": frame.exposure}
+    arrays = frame_images(frame) | {"jitter": frame.jitter}
+    if frame.exposure is not None:
+        arrays |= {"exposure": frame.exposure}
     if frame.camera is not None:
         arrays |= {f"camera.{field.name}": getattr(frame.camera, field.name) for field in dataclasses.fields(Camera)}
     for name, array in arrays.items():
@@ -298,10 +303,12 @@ def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] =
         elif name in ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive"):
             outside = (values < 0) | (values > 1 + 1e-3)
             _reject(outside, values, where, name, "values in [0, 1]", "Rescale or clamp it at import.")
-    jitter, exposure = np.asarray(frame.jitter), np.asarray(frame.exposure)
+    jitter = np.asarray(frame.jitter)
     in_range = np.all((jitter >= -0.5) & (jitter <= 0.5), axis=-1)
     _reject(~in_range, jitter, where, "jitter", "pixels in [-0.5, 0.5)", "Divide it by the image size or subtract 0.5.")
-    _reject(~((exposure > 0) & np.isfinite(exposure)), exposure, where, "exposure", "a positive number", "Use 1.")
+    if frame.exposure is not None:
+        exposure, fix = np.asarray(frame.exposure), "Leave it out (None) where it is not known."
+        _reject(~((exposure > 0) & np.isfinite(exposure)), exposure, where, "exposure", "a positive number", fix)
 
 
 def validate_sequence(sequence: Sequence, name: str = "sequence", requires: Iterable[str] = ()) -> None:

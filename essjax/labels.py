@@ -10,10 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from essjax.color import reinhard
+from essjax.color import expose, reinhard
 from essjax.frames import SampleRanges
 from essjax.interfaces import expand_flag
-from essjax.typing import Array, Bool, Flag, Image, Int, Plane, pytree
+from essjax.typing import Array, Bool, Flag, Image, Int, Plane, Scalar, pytree
 from essjax.warp import backward_warp, inside_mask
 
 GHOSTING = ("visibility", "shading", "none")
@@ -151,7 +151,9 @@ def color_overlap(low: Image, high: Image, other_low: Image, other_high: Image) 
     return common / (volume(low, high) + volume(other_low, other_high) - common)
 
 
-def shading_ghosting(ranges: SampleRanges, previous: SampleRanges, at: Thresholds = DEFAULTS) -> Marks:
+def shading_ghosting(
+    ranges: SampleRanges, previous: SampleRanges, at: Thresholds = DEFAULTS, *, exposure: Scalar | float = 1.0
+) -> Marks:
     """Pixels whose colour changed along the motion (|eq 5| in any channel, and eq 6), opened, not yet corrected.
 
     Our reading: colours after x / (1 + x), so that one threshold serves dark and bright places.
@@ -160,9 +162,13 @@ def shading_ghosting(ranges: SampleRanges, previous: SampleRanges, at: Threshold
       ranges: of this frame, leaves ``[..., H, W, C]``.
       previous: of the frame before.
       at: thresholds.
+      exposure: ``[...]`` of this frame; both are compared at it.
     """
-    low, high = reinhard(ranges.color_min), reinhard(ranges.color_max)
-    there = jnp.concatenate([reinhard(previous.color_min), reinhard(previous.color_max)], axis=-1)
+    low, high, *before = (
+        reinhard(expose(colors, jnp.asarray(exposure)))
+        for colors in (ranges.color_min, ranges.color_max, previous.color_min, previous.color_max)
+    )
+    there = jnp.concatenate(before, axis=-1)
     there = backward_warp(there, ranges.motion, mode="nearest")
     other_low, other_high = there[..., :3], there[..., 3:]
     changed = jnp.max(jnp.abs(high - other_high), axis=-1, keepdims=True) > at.ghosting_color
@@ -184,7 +190,14 @@ def texture_aliasing(ranges: SampleRanges, at: Thresholds = DEFAULTS) -> Marks:
     return (bumps | varied) & ~geometry_aliasing(ranges, at)
 
 
-def label(ranges: SampleRanges, previous: SampleRanges, cut: Flag, at: Thresholds = DEFAULTS) -> Labels:
+def label(
+    ranges: SampleRanges,
+    previous: SampleRanges,
+    cut: Flag,
+    at: Thresholds = DEFAULTS,
+    *,
+    exposure: Scalar | float = 1.0,
+) -> Labels:
     """Both classes of every pixel of one frame.
 
     Shading ghosting is removed where visibility ghosting or aliasing is set. Where ``cut``, everything is visibility
@@ -195,10 +208,11 @@ def label(ranges: SampleRanges, previous: SampleRanges, cut: Flag, at: Threshold
       previous: of the frame before.
       cut: bool ``[...]``.
       at: thresholds.
+      exposure: see ``shading_ghosting``.
     """
     visibility = visibility_ghosting(ranges, previous, at) | expand_flag(cut, ranges.motion.ndim)
     geometry, texture = geometry_aliasing(ranges, at), texture_aliasing(ranges, at)
-    shading = shading_ghosting(ranges, previous, at) & ~(visibility | geometry | texture)
+    shading = shading_ghosting(ranges, previous, at, exposure=exposure) & ~(visibility | geometry | texture)
     return Labels(ghosting=_first(visibility, shading), aliasing=_first(geometry, texture))
 
 
@@ -210,7 +224,12 @@ def _first(*marks: Marks) -> Classes:
     return index
 
 
-def label_sequence(ranges: SampleRanges, cut: Flag, at: Thresholds = DEFAULTS) -> Labels:
-    """``label`` of every frame of a sequence: leaves ``[T, ..., H, W, C]``, ``cut`` ``[T, ...]``; frame 0 is a cut."""
+def label_sequence(
+    ranges: SampleRanges, cut: Flag, at: Thresholds = DEFAULTS, *, exposure: Scalar | float = 1.0
+) -> Labels:
+    """``label`` of every frame of a sequence, frame 0 a cut.
+
+    Leaves ``[T, ..., H, W, C]``, ``cut`` and ``exposure`` ``[T, ...]``.
+    """
     previous = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), ranges)
-    return label(ranges, previous, jnp.asarray(cut).at[0].set(True), at)
+    return label(ranges, previous, jnp.asarray(cut).at[0].set(True), at, exposure=exposure)

@@ -24,7 +24,7 @@ class ClassMaps(NamedTuple):
     Attributes:
       sequence: its name.
       frame: original number.
-      reference: linear ``[H, W, 3]``.
+      reference: exposed ``[H, W, 3]``.
       predicted: question -> index ``[H, W]``.
       automatic: the same of the labels.
     """
@@ -55,11 +55,14 @@ def evaluate_classes(
 
     @functools.partial(jax.jit, compiler_options=options)
     def run(variables: PyTree, frames: Frame, ranges: SampleRanges) -> tuple[dict, dict]:
-        keep = lambda aux: {name: jnp.argmax(aux[name], axis=-1) for name in QUESTIONS}  # noqa: E731
+        def keep(aux: dict) -> dict:
+            return {name: jnp.argmax(aux[name], axis=-1) for name in QUESTIONS} | {"exposure": aux["exposure"]}
+
         batch = jax.tree.map(lambda leaf: leaf[:, None], frames)
         kept = unroll(method, variables, batch, every(), keep=keep).aux[SS]
-        labels = label_sequence(ranges, frames.cut, thresholds)
-        return {n: m[:, 0] for n, m in kept.items()}, {name: getattr(labels, name)[..., 0] for name in QUESTIONS}
+        kept = {name: values[:, 0] for name, values in kept.items()}
+        labels = label_sequence(ranges, frames.cut, thresholds, exposure=kept.pop("exposure"))
+        return kept, {name: getattr(labels, name)[..., 0] for name in QUESTIONS}
 
     counts: dict[str, dict[str, np.ndarray]] = {}
     maps = []
@@ -74,7 +77,7 @@ def evaluate_classes(
         if at:
             n = max(at, key=lambda n: (automatic["ghosting"][n] < 2).mean())
             chosen = [{name: classes[name][n] for name in QUESTIONS} for classes in (predicted, automatic)]
-            maps.append(ClassMaps(clip.name, clip.numbers[n], np.array(clip.sequence.reference[n]), *chosen))
+            maps.append(ClassMaps(clip.name, clip.numbers[n], clip.exposure[n] * clip.sequence.reference[n], *chosen))
     return _scores(counts), maps
 
 

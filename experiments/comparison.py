@@ -152,11 +152,13 @@ def notes(
     share = sum(clip.holes[clip.scored].mean() for clip in clips) / len(clips)
     exact = "exact, from the renderer" if clips[0].exact_holes else "estimated from the G-buffers"
     scored = sum(len(clip.scored) for clip in clips)
+    recorded = all(clip.sequence.frames.exposure is not None for clip in clips)
+    exposure = "recorded with the frames" if recorded else "0.18 over the log-mean of its reference, one per sequence"
     remarks = [
         f"{scored} frames of {len(clips)} sequences are scored, each as SS and as ESS; {config.warmup} frames at the "
-        f"start and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR, SSIM after x/(1+x) "
-        "and sRGB. HR results score against the anti-aliased reference, LR results against that frame's own jittered, "
-        "aliased colour."
+        f"start and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR, SSIM of exposed "
+        f"radiance after x/(1+x) and sRGB; exposure: {exposure}. HR results score against the anti-aliased reference, "
+        "LR results against that frame's own jittered, aliased colour."
     ]
     for row, setting in settings.items():
         chosen = f"alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}"

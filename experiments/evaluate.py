@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.cameras import pixel_positions
-from essjax.color import display
+from essjax.color import display, expose
 from essjax.data import Dataset, Segment, read_segment
 from essjax.data.memory import Kept
+from essjax.exposure import clip_exposure
 from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
 from essjax.interfaces import Method, expand_flag
 from essjax.metrics import PHASES, aggregate, has_source, mean_over, psnr, score_rollout
@@ -47,6 +48,17 @@ class Clip:
     scored: list[int]
     holes: np.ndarray
     exact_holes: bool
+
+    @functools.cached_property
+    def exposure(self) -> np.ndarray:
+        """See ``shown_exposure``."""
+        return shown_exposure(self.sequence)
+
+
+def shown_exposure(sequence: Sequence) -> np.ndarray:
+    """What metrics and pictures multiply radiance with ``[T]``: the recorded exposure, else ``clip_exposure``."""
+    recorded, reference = sequence.frames.exposure, sequence.reference
+    return np.asarray(np.full(len(reference), clip_exposure(reference)) if recorded is None else recorded, np.float32)
 
 
 def scored_frames(cuts: Iterable[Any], counts: Iterable[Any], warmup: int) -> list[int]:
@@ -170,8 +182,8 @@ def reference_at_samples(reference: Array, frames: Frame, scale: int) -> Array:
 
 
 @jax.jit
-def _masked_psnr(images: Array, targets: Array, mask: Array) -> Array:
-    return psnr(display(images), display(targets), mask=mask)
+def _masked_psnr(images: Array, targets: Array, exposure: Array, mask: Array) -> Array:
+    return psnr(display(expose(images, exposure)), display(expose(targets, exposure)), mask=mask)
 
 
 def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str, ...]) -> list[dict[str, Any]]:
@@ -190,12 +202,19 @@ def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str,
     # All frames, so that every sequence has the same shape and compiles once; the warm-up is dropped below.
     everything = list(range(len(kinds)))
     rows = score_rollout(
-        images, targets, scored=everything, kinds=kinds, holes=holes, motion=motion, cuts=np.asarray(frames.cut)
+        images,
+        targets,
+        scored=everything,
+        kinds=kinds,
+        exposure=clip.exposure,
+        holes=holes,
+        motion=motion,
+        cuts=np.asarray(frames.cut),
     )
-    extra = {"psnr_foreground": _masked_psnr(images, targets, foreground)}
+    extra = {"psnr_foreground": _masked_psnr(images, targets, clip.exposure, foreground)}
     if low:
         at_samples = reference_at_samples(clip.sequence.reference, frames, scale)
-        extra["psnr_reference"] = _masked_psnr(images, at_samples, foreground)
+        extra["psnr_reference"] = _masked_psnr(images, at_samples, clip.exposure, foreground)
     extra = {name: np.asarray(values) for name, values in extra.items()}
     return [
         {
@@ -303,6 +322,7 @@ def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
     frames_of_part = {"images": (n, rendered_last), "previous": (n - PHASES, rendered_last - PHASES)}
     picture: dict[str, Any] = {
         "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
+        "exposure": float(clip.exposure[n]),
     }  # fmt: skip
     for part, (frame, index) in frames_of_part.items():
         color = np.repeat(np.repeat(np.asarray(rendered[max(index, 0)]), scale, 0), scale, 1)

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from essjax.color import display
+from essjax.color import display, expose
 from essjax.rollout import alternate, every
 from essjax.train import best_validation
 from essjax.typing import PyTree
@@ -113,7 +113,8 @@ def unchanged(name: str, runner: Runner, initial: PyTree, clip: Clip) -> list[st
     untrained = copy.copy(runner)  # what is compiled serves both
     untrained.variables = {entry: initial[entry] for entry in runner.variables}
     schedule = every() if runner.method.info.renders_all else alternate(0)
-    now, before = (np.asarray(display(run(sequence, schedule))) for run in (runner, untrained))
+    exposure = clip.exposure[:FRAMES]
+    now, before = (np.asarray(display(expose(run(sequence, schedule), exposure))) for run in (runner, untrained))
     if not np.max(np.abs(now - before)) <= SAME_IMAGE:  # nor NaN
         return []
     return [f"{name}: it shows the same as before training."]

@@ -87,14 +87,14 @@ def _score_grid(method: Method, grid: np.ndarray, clip: Clip) -> np.ndarray:
             frame = frame_with_batch_axis(frames, n)
             history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
             if n in clip.scored and made[n]:
-                totals += np.asarray(_grid_psnr(image[:, 0], clip.sequence.reference[n]))
+                totals += np.asarray(_grid_psnr(image[:, 0], clip.sequence.reference[n], clip.exposure[n]))
                 count += 1
     return totals / max(count, 1)
 
 
 @jax.jit
-def _grid_psnr(images: Array, target: Array) -> Array:
-    return jax.vmap(lambda image: psnr(display(image), display(target)))(images)
+def _grid_psnr(images: Array, target: Array, exposure: Array) -> Array:
+    return jax.vmap(lambda image: psnr(display(exposure * image), display(exposure * target)))(images)
 
 
 _COMPILED: dict[Method, dict[str, Any]] = {}

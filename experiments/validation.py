@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from essjax.color import display
+from essjax.color import display, expose
 from essjax.data import Dataset, disk_source
 from essjax.data.loader import DiskSource
 from essjax.frames import Sequence
@@ -14,7 +14,7 @@ from essjax.metrics import psnr
 from essjax.rollout import alternate, every
 from essjax.typing import Array, PyTree
 from experiments.config import Config
-from experiments.evaluate import Runner, scored_frames
+from experiments.evaluate import Runner, scored_frames, shown_exposure
 
 SPLIT = "validation"
 CLIPS = 8
@@ -68,7 +68,7 @@ class Scorer:
             images = self._runner(sequence, schedule)
             low = images.shape[1:3] == sequence.frames.motion.shape[1:3] and not info.native
             targets = sequence.frames.color if low else sequence.reference
-            found = np.asarray(_psnr(images, targets, sequence.frames.exposure))
+            found = np.asarray(_psnr(images, targets, shown_exposure(sequence)))
             kinds = schedule.kinds(len(images))
             shown = len(images) - info.latency
             for n in scored:
@@ -79,5 +79,4 @@ class Scorer:
 
 @jax.jit
 def _psnr(images: Array, targets: Array, exposure: Array) -> Array:
-    exposure = exposure[:, None, None, None]
-    return psnr(display(images * exposure), display(targets * exposure))
+    return psnr(display(expose(images, exposure)), display(expose(targets, exposure)))

@@ -12,7 +12,7 @@ LEVELS = {
     "essjax.cameras": 1, "essjax.kernels": 1, "essjax.color": 1, "essjax.tensors": 1,
     "essjax.frames": 2,
     "essjax.interfaces": 3, "essjax.warp": 3,
-    "essjax.losses": 4, "essjax.networks": 4, "essjax.labels": 4,
+    "essjax.exposure": 4, "essjax.losses": 4, "essjax.networks": 4, "essjax.labels": 4,
     "essjax.methods": 5, "essjax.data": 5, "essjax.scenes": 5,
     "essjax.rollout": 6, "essjax.metrics": 6,
     "essjax.train": 7, "essjax.deploy": 7,

@@ -72,10 +72,10 @@ class SequenceInfo:
       native: whether there are ``native`` files.
       ranges: whether there are ``ranges`` files.
       source: where the frames come from, as the producer describes it.
-      frames: one record per complete frame, in order: ``number``, ``jitter``, ``cut``, ``exposure``, ``camera``
-        (``camera_to_world``, ``focal``, ``center``, or None), ``notes`` (counts); ``native_jitter`` and
-        ``native_camera`` with native; ``made_from``, a short text that differs if the frame was made from other files
-        or content.
+      frames: one record per complete frame, in order: ``number``, ``jitter``, ``cut``, ``exposure`` (a number in all
+        frames or, where it is not known, None in all), ``camera`` (``camera_to_world``, ``focal``, ``center``, or
+        None), ``notes`` (counts); ``native_jitter`` and ``native_camera`` with native; ``made_from``, a short text that
+        differs if the frame was made from other files or content.
       complete: false while frames are still to be written.
       skipped: one record per frame that was left out: ``number``, ``reason`` and ``made_from``.
     """
@@ -220,6 +220,8 @@ def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
         content[field] = tuple(content[field])
     for index, record in enumerate((*content["frames"], *content["skipped"])):
         _check_record(f"{path}, record {index}", record)
+    if len({record.get("exposure") is None for record in content["frames"]}) > 1:
+        raise ValueError(f"{path}: exposure: expected a number for all frames, or null for all; the file is damaged.")
     return SequenceInfo(**{field: content[field] for field in fields})
 
 

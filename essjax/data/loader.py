@@ -90,7 +90,8 @@ class DiskSource:
     def outline(self, index: int) -> tuple[int, int, Any]:
         """Height and width of the frames of sequence ``index``, and what it must have in common with the others."""
         info, records = self._dataset.info, self._records[index]
-        return info.height, info.width, {record.get("camera") is None for record in records}
+        optional = {(record.get("camera") is None, record.get("exposure") is None) for record in records}
+        return info.height, info.width, optional
 
     def window(self, index: int, start: int, length: int, box: tuple[int, int, int, int] | None = None) -> Sequence:
         """What slicing sequence ``index`` in time, then ``crop``, gives, bit by bit; only these frames are read.
@@ -185,7 +186,10 @@ def check_alike(source: Source, crop: tuple[int, int] | None) -> None:
         if crop is None and (height, width) != first[:2]:
             raise ValueError(f"clips: sequence {index} has another size than sequence 0. Give a crop that fits both.")
         if kind != first[2]:
-            raise ValueError(f"clips: sequence {index} has another scale or other buffers than sequence 0.")
+            raise ValueError(
+                f"clips: sequence {index} has another scale or other buffers than sequence 0, or only one of them has "
+                "cameras or an exposure."
+            )
 
 
 def _cut_out(source: Source, index: int, start: int, length: int, box: tuple[int, int, int, int] | None) -> Sequence:

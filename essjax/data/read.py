@@ -45,7 +45,7 @@ def _make_frame(images: Mapping[str, np.ndarray], record: Mapping, prefix: str =
         motion=images["motion"],
         jitter=np.asarray(record[f"{prefix}jitter"], np.float32),
         cut=np.asarray(record["cut"], bool),
-        exposure=np.asarray(record["exposure"], np.float32),
+        exposure=None if record["exposure"] is None else np.asarray(record["exposure"], np.float32),
         camera=_make_camera(record[f"{prefix}camera"]),
         reactive=images.get("reactive"),
     )

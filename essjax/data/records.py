@@ -53,7 +53,7 @@ def frame_record(number: int, frame: Frame, native: Frame | None, made_from: str
         "made_from": made_from,
         "jitter": np.asarray(frame.jitter).tolist(),
         "cut": bool(frame.cut),
-        "exposure": float(frame.exposure),
+        "exposure": None if frame.exposure is None else float(frame.exposure),
         "camera": _camera_record(frame.camera),
     }
     if native is not None:

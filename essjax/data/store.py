@@ -159,7 +159,7 @@ class SequenceWriter:
             self.name, width, height, scale, channels, native is not None, self.source, ranges=ranges is not None
         )
 
-    def _check_next(self, number: int, described: SequenceInfo, cut: bool) -> SequenceInfo:
+    def _check_next(self, number: int, described: SequenceInfo, cut: bool, exposure: Any) -> SequenceInfo:
         info = self.info or described
         for field in (*AGREE, "native"):
             if getattr(info, field) != getattr(described, field):
@@ -167,6 +167,12 @@ class SequenceWriter:
                     f"sequence {self.name}, frame {number}: {field} changes from {getattr(info, field)} to "
                     f"{getattr(described, field)}; {DISAGREES}."
                 )
+        if info.frames and (exposure is None) != (info.frames[0]["exposure"] is None):
+            there, here = ("has one", "has none") if exposure is None else ("has none", "has one")
+            raise ValueError(
+                f"sequence {self.name}, frame {number}: exposure: frame {info.numbers[0]} {there}, this one {here}; "
+                f"{DISAGREES}. Give it for all, or for none."
+            )
         if info.frames and number != info.numbers[-1] + 1 and not (cut and number > info.numbers[-1]):
             raise ValueError(
                 f"sequence {self.name}: expected frame {info.numbers[-1] + 1} next, got {number}. Motion links each "
@@ -210,7 +216,7 @@ class SequenceWriter:
         if self._is_there(number, made_from):
             return
         self._validate(number, frame, reference, extra)
-        self._check_next(number, self._describe(frame, reference, extra), bool(frame.cut))
+        self._check_next(number, self._describe(frame, reference, extra), bool(frame.cut), frame.exposure)
         self.commit(self._write_images(number, frame, reference, extra, notes or {}, {}, made_from))
 
     def _is_there(self, number: int, made_from: str) -> bool:
@@ -278,7 +284,7 @@ class SequenceWriter:
         """
         cut = cut or prepared.record["cut"]
         try:
-            info = self._check_next(prepared.number, prepared.described, cut)
+            info = self._check_next(prepared.number, prepared.described, cut, prepared.record["exposure"])
         except ValueError:
             self.discard(prepared.number)
             raise

@@ -6,6 +6,7 @@ import math
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse
+from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, no_variables
 from essjax.methods.shots import within_shots
@@ -37,8 +38,11 @@ def _spatial(name: str, scale: float, upscale: Callable[[Frame], Array]) -> Meth
     def extrapolate_step(variables, history, frame, *, train=False):
         return history, Prediction(image=history["image"])
 
+    def map_radiance(function, history):
+        return {"image": function(history["image"])}
+
     info = MethodInfo(name=name, scale=scale, predicts=frozenset({"ss"}))
-    return within_shots(Method(no_variables, start, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(no_variables, start, render_step, extrapolate_step, info), map_radiance))
 
 
 def _without_jitter(frame: Frame) -> Frame:
@@ -97,7 +101,7 @@ def warp(*, blur: float = 0.0) -> Method:
 
     Not demodulated, jitter difference included, border repeated, one resampling however many frames are
     extrapolated in a row: motion is composed along the path back to the rendered frame. A rendered frame is stored
-    and returned as it is.
+    and returned as it is. All of it is linear, so the exposure is of no account.
 
     Args:
       blur: standard deviation in pixels of a Gaussian on the frame before the warp. It removes noise, and nothing

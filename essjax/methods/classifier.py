@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
+from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, depth_scale, rendered_color
 from essjax.interfaces import Method, MethodInfo, Network, expand_flag, refuse_extrapolation, reset_at_cut
 from essjax.methods.shots import upsampled_reactive
 from essjax.networks import classifier_network, composition_network
-from essjax.typing import Array, Color, Flag, Image, Mask, Motion, Plane, pytree
+from essjax.typing import Array, Callable, Color, Flag, Image, Mask, Motion, Plane, pytree
 from essjax.warp import (
     Resampled,
     backward_warp,
@@ -39,9 +40,9 @@ class History:
     """The recurrent state, at the output's resolution ``[..., sH, sW, C]``.
 
     Attributes:
-      image: last output, x / (1 + x).
+      image: last output, linear; the steps see it as x / (1 + x), like ``low`` and ``high``.
       counter: valid frames accumulated so far, ``[..., 1]``; 0 after visibility ghosting.
-      low: lower end of the colours that were accumulated, x / (1 + x).
+      low: lower end of the colours that were accumulated, linear.
       high: upper end.
       closeness: reversed depth of the last frame, see ``closeness``.
       logits: of the last classification, ``[..., 6]``.
@@ -57,6 +58,12 @@ class History:
     logits: Image
     depth_scale: Array
     empty: Flag
+
+
+def map_colors(function: Callable[[Array], Array], history: History) -> History:
+    """``function`` of the three colours of a history."""
+    colors = {name: function(getattr(history, name)) for name in ("image", "low", "high")}
+    return dataclasses.replace(history, **colors)
 
 
 class Current(NamedTuple):
@@ -245,7 +252,7 @@ def classifier(
         }
 
     def render_step(variables, history: History, frame: Frame, *, train=False):
-        history = reset_at_cut(frame.cut, start(frame), history)
+        history = map_colors(reinhard, reset_at_cut(frame.cut, start(frame), history))
         current = look(frame, history.depth_scale, scale, sigma)
         warped = warp_history(history, current)
         inputs = classifier_inputs(current, warped)
@@ -279,7 +286,8 @@ def classifier(
             "encoded": image, "warped": warped.image, "known": warped.known,
         }  # fmt: skip
         states = {"classifier": state} if state else {}
-        return new, Prediction(image=reinhard_inverse(image), aux=aux, state=states)
+        new = map_colors(reinhard_inverse, new)
+        return new, Prediction(image=new.image, aux=aux, state=states)
 
     info = MethodInfo("classifier", scale=scale, predicts=frozenset({"ss"}), renders_all=True)
-    return Method(init, start, render_step, refuse_extrapolation("classifier"), info)
+    return exposed(Method(init, start, render_step, refuse_extrapolation("classifier"), info), map_colors)

@@ -8,6 +8,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from essjax.exposure import metered
 from essjax.frames import Frame, Prediction, without_color
 from essjax.interfaces import Method, MethodInfo, Step, no_variables
 from essjax.methods.shots import continued
@@ -33,6 +34,7 @@ def composed(
     ``variables`` are those of both, side by side. ``aux`` is the second's, and the first's prediction as ``"first"``.
     Where the first lags behind (interpolation), the second sees the frame that the image belongs to. A ``second`` that
     takes all frames for rendered starts anew with the first one that was: it does not trust ``shots.unlit`` either.
+    Both work at the exposure of the frame that came in.
 
     Args:
       name: of the whole.
@@ -88,12 +90,14 @@ def composed(
         renders_all=first.info.renders_all,
     )
     extrapolate = second.extrapolate_step if extrapolates else second.render_step
-    return Method(
-        init,
-        start,
-        after(first.render_step, second.render_step, rendered=True),
-        after(first.extrapolate_step, extrapolate, rendered=False),
-        info,
+    return metered(
+        Method(
+            init,
+            start,
+            after(first.render_step, second.render_step, rendered=True),
+            after(first.extrapolate_step, extrapolate, rendered=False),
+            info,
+        )
     )
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
 from essjax.color import reinhard, reinhard_inverse
+from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation
 from essjax.methods.shots import continued, without_history
@@ -69,6 +70,12 @@ def _returning_clip_backward(x: Array, gradient: Array) -> tuple[Array]:
 
 
 returning_clip.defvjp(_returning_clip_forward, _returning_clip_backward)
+
+
+def map_color(function: Callable[[Array], Array], history: dict) -> dict:
+    """``function`` of the colour of a history, which is linear; its fourth channel stays as it is."""
+    image = history["image"]
+    return {**history, "image": jnp.concatenate([function(image[..., :3]), image[..., 3:]], axis=-1)}
 
 
 def _name(reprojection: str, dilate: bool, accumulation: bool) -> str:
@@ -132,7 +139,8 @@ def dlctus(
     def reproject(history, frame: Frame, fallback: Image) -> Array:
         motion = dilate_motion(frame.motion, frame.gbuffers.depth) if dilate else frame.motion
         motion = jax.lax.stop_gradient(upsample_motion(motion, scale, jitter=frame.jitter))
-        past = jnp.where(inside_mask(motion) > 0, REPROJECTIONS[reprojection](history["image"], motion), fallback)
+        image = map_color(reinhard, history)["image"]
+        past = jnp.where(inside_mask(motion) > 0, REPROJECTIONS[reprojection](image, motion), fallback)
         return without_history(past, fallback, continued(frame, history["empty"]), scale)
 
     def render_step(variables, history, frame: Frame, *, train: bool = False):
@@ -148,10 +156,10 @@ def dlctus(
         mixed = aligned * rate + past * (1.0 - rate)  # eq 44
         quality = mixed[..., 3:] * decay if accumulation else None  # eq 45
         encoded = jnp.clip(mixed[..., :3], 0.0, 1.0)
-        image = encoded if quality is None else jnp.concatenate([encoded, jnp.clip(quality, 0.0, 1.0)], axis=-1)
-        history = {"image": image, "empty": jnp.zeros_like(history["empty"])}
+        kept = encoded if quality is None else jnp.concatenate([encoded, jnp.clip(quality, 0.0, 1.0)], axis=-1)
+        history = map_color(reinhard_inverse, {"image": kept, "empty": jnp.zeros_like(history["empty"])})
         aux = {"encoded": encoded, "rate": rate, "accumulation": quality}
-        return history, Prediction(image=reinhard_inverse(encoded), aux=aux)
+        return history, Prediction(image=history["image"][..., :3], aux=aux)
 
     info = MethodInfo(name=name, scale=scale, predicts=frozenset({"ss"}), renders_all=True)
-    return Method(init, start, render_step, refuse_extrapolation(name), info)
+    return exposed(Method(init, start, render_step, refuse_extrapolation(name), info), map_color)

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 
 from essjax import networks
 from essjax.color import demodulate, expm1, log1p, modulate
+from essjax.exposure import exposed
 from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require, surface_guides
 from essjax.interfaces import Method, MethodInfo, expand_flag
-from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, push, reset_memory, start_memory
+from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_shading, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import from_torch as network_from_torch
@@ -172,7 +173,7 @@ def extranet(*, history: bool = True, occlusion: bool = True, published: bool = 
         return memory, Prediction(image=image, aux=aux, state={"extranet": state} if state else {})
 
     info = MethodInfo("extranet", scale=1, requires=REQUIRES, predicts=frozenset({"ess"}))
-    return within_shots(Method(init, _start, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(init, _start, render_step, extrapolate_step, info), map_shading))
 
 
 def from_torch(weights: str | Path | Mapping[str, Array]) -> PyTree:

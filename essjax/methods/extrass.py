@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import expm1, log1p, log1p_of_reinhard, reinhard, rgb_to_ycocg, ycocg_to_rgb
+from essjax.exposure import exposed
 from essjax.frames import (
     Frame,
     GBuffers,
@@ -26,6 +27,7 @@ from essjax.methods.rendered import (
     Memory,
     advance,
     hole_buffers,
+    map_shading,
     push_pair,
     reset_pair,
     start_pair,
@@ -256,5 +258,9 @@ def extrass(
         aux = {"log_image": log_image, "warped": warped, "features": features, "extrapolated": low}
         return history, Prediction(image=image, aux=aux)
 
+    def map_radiance(function, history):
+        rendered = map_shading(function, history.rendered)
+        return dataclasses.replace(history, image=function(history.image), rendered=rendered)
+
     info = MethodInfo("extrass", scale=scale, requires=GUIDED)
-    return within_shots(Method(init, start, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance))

@@ -7,9 +7,19 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import expm1, log1p, sum_channels
+from essjax.exposure import exposed
 from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require, select_time, surface_guides
 from essjax.interfaces import Method, MethodInfo, Network, no_variables
-from essjax.methods.rendered import GUIDED, Memory, advance, guided_extrapolation, push_pair, reset_pair, start_pair
+from essjax.methods.rendered import (
+    GUIDED,
+    Memory,
+    advance,
+    guided_extrapolation,
+    map_shading,
+    push_pair,
+    reset_pair,
+    start_pair,
+)
 from essjax.methods.shots import within_shots
 from essjax.networks import frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
@@ -18,7 +28,7 @@ from essjax.warp import backward_warp
 from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
 
 RATIO_FLOOR = 0.02
-"""Radiance added to both sides of FRNet's change of shading, so that black stays black."""
+"""Exposed radiance added to both sides of FRNet's change of shading, so that black stays black."""
 REFINE_DELTA = 0.1
 """delta_1 = delta_2 of eq 6."""
 
@@ -43,7 +53,7 @@ def extrass_w(
         return history, Prediction(image=image, aux={"warp": image})
 
     info = MethodInfo("extrass-w", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
-    return within_shots(Method(no_variables, start_pair, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(no_variables, start_pair, render_step, extrapolate_step, info), map_shading))
 
 
 def _store(history: Memory, frame: Frame) -> Memory:
@@ -172,4 +182,4 @@ def extrass_e(
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
     info = MethodInfo("extrass-e", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
-    return within_shots(Method(init, start_pair, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(init, start_pair, render_step, extrapolate_step, info), map_shading))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from essjax import networks
 from essjax.cameras import pixel_positions
 from essjax.color import demodulate, expm1, log1p, modulate
+from essjax.exposure import exposed
 from essjax.frames import (
     Frame,
     GBuffers,
@@ -31,6 +32,7 @@ from essjax.methods.rendered import (
     advance,
     albedo,
     hole_buffers,
+    map_content,
     push,
     reset_memory,
     start_memory,
@@ -59,9 +61,9 @@ class Kept:
     """What is kept of a rendered frame.
 
     Attributes:
-      shading: demodulated colour, log1p, ``[..., H, W, 3]``.
+      shading: demodulated colour, linear, ``[..., H, W, 3]``.
       hidden: the recurrent state after it, at pixel centres, ``[..., H, W, width]``.
-      image: the output, log1p, ``[..., round(scale H), round(scale W), 3]``.
+      image: the output, linear, ``[..., round(scale H), round(scale W), 3]``.
       surfaces: the G-buffers that tell surfaces apart.
     """
 
@@ -159,7 +161,8 @@ def _read(last: Rendered, frame: Frame, scale: float, valid: Mask, trust: Mask) 
     """
     height, low_width = frame.motion.shape[-3:-1]
     kept, motion = last.content, jax.lax.stop_gradient(last.motion)
-    shading = backward_warp(jax.lax.stop_gradient(kept.shading), jittered_motion(motion, frame.jitter, last.jitter))
+    shading, image = log1p(jax.lax.stop_gradient(kept.shading)), log1p(kept.image)
+    shading = backward_warp(shading, jittered_motion(motion, frame.jitter, last.jitter))
     hidden = backward_warp(kept.hidden, upsample_motion(motion, 1, jitter=frame.jitter))
     samples = pixel_positions(height, low_width, frame.jitter) + motion
     # Dilated, so that the history of a silhouette moves with the surface in front.
@@ -168,9 +171,9 @@ def _read(last: Rendered, frame: Frame, scale: float, valid: Mask, trust: Mask) 
     return {
         "shading": shading,
         "hidden": _as_far_as(valid, hidden),
-        "sampled": _as_far_as(inside_mask(motion) * trust, sample(kept.image, scale * samples)),
+        "sampled": _as_far_as(inside_mask(motion) * trust, sample(image, scale * samples)),
         # Bicubic: bilinear would blur the history a little more with every frame.
-        "image": backward_warp(kept.image, at_output, mode="bicubic"),
+        "image": backward_warp(image, at_output, mode="bicubic"),
         "known": known,
     }
 
@@ -269,16 +272,17 @@ def fasset(
         return base + share * difference + color, hidden, {"fasset": state} if state else {}
 
     def render_step(variables, history, frame, *, train=False):
-        shading = log1p(demodulate(rendered_color(frame, name), albedo(frame.gbuffers)))
+        linear = demodulate(rendered_color(frame, name), albedo(frame.gbuffers))
+        shading = log1p(linear)
         history, arrival = _arrive(history, frame, scale, width)
         mask = arrival.recent if mask_rendered else jnp.ones_like(arrival.recent)
         near = sample_nearness(*shading.shape[-3:-1], scale, frame.jitter)
         log_image, hidden, state = predict(variables, history, frame, shading, mask, arrival, near, train, "render")
-        image = jnp.maximum(log_image, 0.0)  # as it is shown
-        kept = Kept(shading=shading, hidden=hidden, image=image, surfaces=_surfaces(frame.gbuffers))
+        image = expm1(log_image)
+        kept = Kept(shading=linear, hidden=hidden, image=image, surfaces=_surfaces(frame.gbuffers))
         history = dataclasses.replace(history, rendered=push(history.rendered, frame, kept))
         aux = {"log_image": log_image, "mask": mask, "valid": arrival.recent}
-        return history, Prediction(image=expm1(log_image), aux=aux, state=state)
+        return history, Prediction(image=image, aux=aux, state=state)
 
     def extrapolate_step(variables, history, frame, *, train=False):
         history, arrival = _arrive(history, frame, scale, width)
@@ -288,8 +292,13 @@ def fasset(
         aux = {"log_image": log_image, "mask": mask, "valid": mask}
         return history, Prediction(image=expm1(log_image), aux=aux, state=state)
 
+    def map_radiance(function, history):
+        names = "shading", "image"
+        scaled = lambda kept: dataclasses.replace(kept, **{name: function(getattr(kept, name)) for name in names})  # noqa: E731
+        return dataclasses.replace(history, rendered=map_content(scaled, history.rendered))
+
     info = MethodInfo(name, scale=scale, requires=GUIDED)
-    return within_shots(Method(init, start, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance))
 
 
 def _guides(history: History, frame: Frame) -> Image:

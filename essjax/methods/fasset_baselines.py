@@ -5,13 +5,14 @@ import dataclasses
 import jax.numpy as jnp
 
 from essjax.color import demodulate, expm1, modulate
+from essjax.exposure import exposed
 from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods.baselines import jau_image
 from essjax.methods.composed import composed
 from essjax.methods.extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
 from essjax.methods.nsrr import nsrr
-from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, push, reset_memory, start_memory
+from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_shading, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
 from essjax.networks.extranet import FRAMES, input_shapes
 from essjax.networks.extranet import extranet as extranet_network
@@ -111,7 +112,7 @@ def extranet_plus(scale: int = 2) -> Method:
     network = extranet_network()
 
     def samples(shading: Color, frame: Frame) -> Image:
-        """Shading and 1 where there is a sample, ``[..., sH, sW, 4]``."""
+        """Shading and a channel > 0 where there is a sample (it is scaled like colour), ``[..., sH, sW, 4]``."""
         known = jnp.concatenate([shading, jnp.ones_like(shading[..., :1])], axis=-1)
         return zero_upsample(known, scale, frame.jitter)
 
@@ -144,4 +145,4 @@ def extranet_plus(scale: int = 2) -> Method:
         return memory, Prediction(image=image, aux=aux, state={"extranet_plus": state} if state else {})
 
     info = MethodInfo("extranet-plus", scale=scale, requires=REQUIRES, predicts=frozenset({"ess"}))
-    return within_shots(Method(init, start, render_step, extrapolate_step, info))
+    return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_shading))

@@ -6,13 +6,16 @@ follow: ``warp_3d`` (Mark et al. 1997) and ``bsr`` (Yang et al. 2011). They foll
 frames, halved; of the interpolated frame they only use its motion vectors, as links of that path.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
+from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color, select_time
 from essjax.interfaces import Init, Method, MethodInfo, expand_flag, no_variables
-from essjax.methods.rendered import Memory, advance, push, reset_memory, start_memory
+from essjax.methods.rendered import Memory, advance, map_content, push, reset_memory, start_memory
 from essjax.methods.shots import unlit
 from essjax.typing import Callable, Color, Flag, Jitter, Mask, Motion, Plane, PyTree, pytree
 from essjax.warp import backward_warp, inside_mask, jittered_motion, sample, splat_motion
@@ -121,8 +124,12 @@ def interpolator(name: str, between: Between, *, init: Init = no_variables) -> M
         memory = advance(reset_memory(nothing, start(frame).rendered, history.rendered), frame)
         return History(rendered=memory, waiting=jnp.ones_like(history.waiting)), Prediction(image=image)
 
+    def map_radiance(function, history):
+        scaled = lambda kept: dataclasses.replace(kept, color=function(kept.color))  # noqa: E731
+        return dataclasses.replace(history, rendered=map_content(scaled, history.rendered))
+
     info = MethodInfo(name, scale=1, latency=1, predicts=frozenset({"ess"}))
-    return Method(init, start, render_step, extrapolate_step, info)
+    return exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance)
 
 
 @pytree

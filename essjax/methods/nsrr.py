@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
 from essjax.color import display, display_inverse
+from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, depth_scale, network_depth, rendered_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
 from essjax.methods.baselines import jau_image
@@ -27,7 +28,8 @@ class History:
     """The frames to look back at.
 
     Attributes:
-      rendered: the four latest frames; their content are features ``[4, ..., H, W, FEATURES]``, low resolution.
+      rendered: the four latest frames; their content are features ``[4, ..., H, W, FEATURES]``, low resolution, of
+        each frame at its own exposure.
       depth_scale: unit of depth, ``[...]``: that of the first frame since the cut.
     """
 
@@ -107,5 +109,5 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool =
 
     info = MethodInfo("nsrr", scale=scale, predicts=frozenset({"ss"}), renders_all=not half)
     if not half:
-        return Method(init, start, render_step, refuse_extrapolation("nsrr"), info)
-    return within_shots(Method(init, start, render_step, pass_step, info))
+        return exposed(Method(init, start, render_step, refuse_extrapolation("nsrr"), info))
+    return within_shots(exposed(Method(init, start, render_step, pass_step, info)))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from essjax.color import demodulate, demodulation_albedo, modulate, reinhard, reinhard_inverse
 from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
 from essjax.interfaces import expand_flag, reset_at_cut
-from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
+from essjax.typing import Array, Callable, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
 from essjax.warp import backward_warp, compose_motion, gbuffer_guided_warp, guides, jittered_motion
 
 GUIDED = frozenset({"base_color", "normal"})
@@ -120,6 +120,17 @@ def push(memory: Memory, frame: Frame, content: PyTree) -> Memory:
 
     frames = jax.tree.map(shift, _remember(frame, content), memory.frames)
     return dataclasses.replace(memory, frames=frames, count=memory.count + 1)
+
+
+def map_content(function: Callable[[PyTree], PyTree], memory: Memory) -> Memory:
+    """``memory`` with ``function`` of what is kept of its frames."""
+    frames = dataclasses.replace(memory.frames, content=function(memory.frames.content))
+    return dataclasses.replace(memory, frames=frames)
+
+
+def map_shading(function: Callable[[Array], Array], memory: Memory) -> Memory:
+    """``memory`` with ``function`` of the shading that it keeps: what of it is radiance."""
+    return map_content(lambda kept: dataclasses.replace(kept, shading=function(kept.shading)), memory)
 
 
 def albedo(gbuffers: GBuffers) -> Color:

@@ -7,6 +7,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from essjax.exposure import metered
 from essjax.frames import Frame
 from essjax.interfaces import Method, expand_flag
 from essjax.typing import Color, Flag, Image, Mask, PyTree, pytree
@@ -81,7 +82,8 @@ def within_shots(method: Method) -> Method:
     is a cut for ``method``, which so neither trusts that picture nor remembers anything from before the shot.
 
     Args:
-      method: without latency; its own steps forget everything where ``frame.cut``.
+      method: without latency; its own steps forget everything where ``frame.cut``. Frames without an exposure are
+        metered for it and for ``unlit``.
 
     Raises:
       ValueError: the method lags: its step's image is not that of the step's frame.
@@ -104,4 +106,4 @@ def within_shots(method: Method) -> Method:
         image = jnp.where(expand_flag(seen.cut, fallback.ndim), fallback, prediction.image)
         return Shot(inner=inner, empty=seen.cut), dataclasses.replace(prediction, image=image)
 
-    return method._replace(start=start, render_step=render_step, extrapolate_step=extrapolate_step)
+    return metered(method._replace(start=start, render_step=render_step, extrapolate_step=extrapolate_step))

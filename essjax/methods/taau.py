@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
+from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
 from essjax.methods.shots import upsampled_reactive, within_shots
@@ -90,8 +91,8 @@ def _path(history: PyTree, frame: Frame, settings: Settings) -> tuple[Array, Arr
 def _reproject(
     history: PyTree, motion: Array, trust: Array | None, frame: Frame, settings: Settings
 ) -> tuple[Array, Array]:
-    """The history's image at the current frame's pixels, and its count: 0 where there is none (off screen, cut)."""
-    color = jnp.clip(backward_warp(history["color"], motion, mode=settings.history_mode), 0.0, 1.0)
+    """The history's image at the current frame's pixels, x / (1 + x), and its count: 0 where none (off screen, cut)."""
+    color = jnp.clip(backward_warp(reinhard(history["color"]), motion, mode=settings.history_mode), 0.0, 1.0)
     count = backward_warp(history["count"], motion) * inside_mask(motion)
     count = count if trust is None else count * trust
     return color, jnp.where(expand_flag(frame.cut, count.ndim), 0.0, count)
@@ -124,12 +125,13 @@ def _render_step(settings: Settings, variables: PyTree, history: PyTree, frame: 
     image = past + rate * (current.color - past)
     upsampled = jitter_aligned_upsample(color, settings.scale, frame.jitter)
     image = jnp.where(count > 0, image, upsampled)
+    image = reinhard_inverse(image)
     new = {"color": image, "count": total}
     if "motion" in history:
         new["motion"] = jnp.zeros_like(history["motion"])
     if "trust" in history:
         new["trust"] = jnp.ones_like(history["trust"])
-    return new, Prediction(image=reinhard_inverse(image), aux={"rate": rate})
+    return new, Prediction(image=image, aux={"rate": rate})
 
 
 def _warp_step(settings: Settings, history: PyTree, frame: Frame) -> tuple[PyTree, Prediction]:
@@ -168,6 +170,9 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
     def extrapolate_step(variables, history, frame, *, train=False):
         return _warp_step(settings, history, frame)
 
+    def map_radiance(function, history):
+        return {**history, "color": function(history["color"])}
+
     info = MethodInfo(
         name=name,
         scale=settings.scale,
@@ -176,8 +181,8 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
         renders_all=not half,
     )
     if not half:
-        return Method(init, start, render_step, refuse_extrapolation(name), info)
-    return within_shots(Method(init, start, render_step, extrapolate_step, info))
+        return exposed(Method(init, start, render_step, refuse_extrapolation(name), info), map_radiance)
+    return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance))
 
 
 def taau(

@@ -1,6 +1,7 @@
 """Metrics on display-referred images in [0, 1]: one value per image, data range 1.
 
-``score_rollout`` and everything printed take linear HDR and apply ``essjax.color.display`` (x / (1 + x), then sRGB);
+``score_rollout`` and everything printed take linear HDR, multiply it by an exposure (``essjax.exposure``) and apply
+``essjax.color.display`` (x / (1 + x), then sRGB);
 the single metrics take images that already are display-referred, with any leading axes.
 """
 

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.color import display
+from essjax.exposure import clip_exposure
 from essjax.losses.pixel import as_float32
 from essjax.metrics.psnr import psnr
 from essjax.metrics.ssim import ssim
 from essjax.metrics.temporal import spatio_temporal_error, tpsnr, warped_error
-from essjax.typing import Array, Color, Int, Mask, Motion
+from essjax.typing import Array, Color, Int, Mask, Motion, Scalar
 from essjax.warp import compose_motion
 
 METRICS = (
@@ -41,6 +42,7 @@ def score_rollout(
     *,
     scored: Sequence[int],
     kinds: Sequence[str],
+    exposure: Scalar | float | None = None,
     holes: Mask | None = None,
     motion: Motion | None = None,
     cuts: Sequence[bool] | None = None,
@@ -52,6 +54,8 @@ def score_rollout(
       targets: the same shape, what it should have returned.
       scored: indices of the frames to score; the two frames before them are read for the temporal metrics.
       kinds: "ss" or "ess" for each of the T frames.
+      exposure: ``[T]`` or one number, what radiance is multiplied with before it is displayed, frames that are compared
+        with frame n by that of frame n; None: ``exposure.clip_exposure`` of the targets, one number.
       holes: ``[T, H, W, 1]``, 1 on disoccluded pixels, at the images' resolution; without it ``psnr_holes`` and
         ``hole_share`` are None and the warped error looks at all pixels.
       motion: ``[T, H, W, 2]`` to the frame before, pixels at the images' resolution, with the jitter difference where
@@ -92,7 +96,9 @@ def score_rollout(
     consecutive = (since_cut[now] >= 1) & ("ess" not in kinds)
     # Where there is nothing to compare with: the frame itself, whose values are dropped below.
     before, like = np.where(consecutive, now - 1, now), np.where(alike, now - PHASES, now)
-    measured = _score_frames(images, targets, holes, motion, np.stack([now, before, like], axis=-1))
+    shown = np.broadcast_to(clip_exposure(targets) if exposure is None else np.asarray(exposure), length)
+    places = np.stack([now, before, like], axis=-1)
+    measured = _score_frames(images, targets, jnp.asarray(shown, jnp.float32), holes, motion, places)
     columns = {name: np.asarray(values) for name, values in measured.items()}
     rows = {}
     for k, n in enumerate(scored):
@@ -126,19 +132,29 @@ def _frames_since_cut(length: int, cuts: Sequence[bool] | None) -> np.ndarray:
 
 @jax.jit
 def _score_frames(
-    images: Color, targets: Color, holes: Mask | None, motion: Motion | None, places: Int[Array, "N 3"]
+    images: Color,
+    targets: Color,
+    exposure: Scalar,
+    holes: Mask | None,
+    motion: Motion | None,
+    places: Int[Array, "N 3"],
 ) -> dict[str, Array]:
     """Frame by frame (``lax.map``), so that memory does not grow with the length of the sequence."""
-    return jax.lax.map(lambda place: _score_frame(images, targets, holes, motion, place), places)
+    return jax.lax.map(lambda place: _score_frame(images, targets, exposure, holes, motion, place), places)
 
 
 def _score_frame(
-    images: Color, targets: Color, holes: Mask | None, motion: Motion | None, place: Int[Array, "3"]
+    images: Color,
+    targets: Color,
+    exposure: Scalar,
+    holes: Mask | None,
+    motion: Motion | None,
+    place: Int[Array, "3"],
 ) -> dict[str, Array]:
     """Metrics of a frame; ``place`` is its index, that of the one just before and that of the one of its phase."""
     pictures = images[place], targets[place]
-    image, image_before, image_like = display(pictures[0])
-    target, target_before, target_like = display(pictures[1])
+    image, image_before, image_like = display(exposure[place[0]] * pictures[0])
+    target, target_before, target_like = display(exposure[place[0]] * pictures[1])
     result = {
         "non_finite": ~jnp.all(jnp.isfinite(jnp.stack(pictures))),
         "psnr": psnr(image, target),

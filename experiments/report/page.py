@@ -48,8 +48,9 @@ def write_report(
         metrics ...}]}``; ``"<metric>_range"`` in a row is shown as "±".
       curves: method -> sequence -> one entry per frame and kind, ``{"frame", "kind", "resolution", metrics ...}``.
       pictures: ``{"sequence", "frame", "kind", "resolution", "images": {name: [H, W, 3] linear HDR}, "previous": the
-        same of the frame two before (optional, for flicker)}``; the images hold "reference" and, if wanted, "input".
-        Most interesting first: what does not fit the size limit is left out from the end.
+        same of the frame two before (optional, for flicker), "exposure": what they are multiplied with before they are
+        shown (optional, 1)}``; the images hold "reference" and, if wanted, "input". Most interesting first: what does
+        not fit the size limit is left out from the end.
       notes: remarks to the reader, one paragraph each.
       references: methods shown for orientation, never marked best, with the reason.
       training: how each stage learned, see ``learning_section``.

@@ -62,8 +62,10 @@ def make_picture(entry: Mapping[str, Any]) -> Picture:
         if np.ndim(image) != 3 or np.shape(image)[-1] != 3:
             raise ValueError(f"{name}, {key}: expected an image [H, W, 3], got {np.shape(image)}.")
     order = sorted(entry["images"], key=lambda key: {"input": -1, "reference": 1}.get(key, 0))
-    shown = {key: pixels.shown(entry["images"][key]) for key in order}
-    previous = {key: pixels.shown(image) for key, image in (entry.get("previous") or {}).items() if key in shown}
+    exposure = np.float32(entry.get("exposure", 1.0))
+    shown = {key: pixels.shown(exposure * entry["images"][key]) for key in order}
+    before = (entry.get("previous") or {}).items()
+    previous = {key: pixels.shown(exposure * image) for key, image in before if key in shown}
     reference = shown["reference"]
     compared = {key: image for key, image in shown.items() if image.shape == reference.shape}
     scores = {

@@ -252,6 +252,15 @@ def test_sequences_with_and_without_cameras_do_not_go_together(tmp_path):
         clips(disk_source(dataset, "train"), length=2, batch=1, crop=(4, 13))
 
 
+def test_sequences_with_and_without_exposure_do_not_go_together(tmp_path):
+    bare = coordinates(1)
+    write_sequence(tmp_path, "a", coordinates(0))
+    write_sequence(tmp_path, "b", dataclasses.replace(bare, frames=dataclasses.replace(bare.frames, exposure=None)))
+    dataset = write_dataset(tmp_path, {"train": ["a", "b"]})
+    with pytest.raises(ValueError, match="sequence 1 .* or only one of them has cameras or an exposure"):
+        clips(disk_source(dataset, "train"), length=2, batch=1)
+
+
 def test_one_batch_held_ready_is_no_reason_for_a_warning(caplog):
     assert next(iter(clips([coordinates(0)], length=2, batch=1, prefetch=1))) and not caplog.records
 

@@ -233,6 +233,45 @@ def test_frames_must_follow_each_other(tmp_path):
     assert writer.finish().numbers == (0, 2)
 
 
+def without_exposure(source):
+    native = None if source.native is None else dataclasses.replace(source.native, exposure=None)
+    return dataclasses.replace(source, frames=dataclasses.replace(source.frames, exposure=None), native=native)
+
+
+def test_an_exposure_that_is_not_recorded_is_none_again(tmp_path):
+    written = without_exposure(sequence(native=True))
+    write_sequence(tmp_path, "a", written)
+    record = json.loads((tmp_path / "a" / "sequence.json").read_text())["frames"][0]
+    assert record["exposure"] is None
+    dataset = write_dataset(tmp_path, {"train": ["a"]})
+    assert_close(read_sequence(dataset, "a"), written)
+    window = disk_source(dataset, "train", native=True).window(0, 1, 2)
+    assert window.frames.exposure is None and window.native.exposure is None
+
+
+def test_all_frames_of_a_sequence_have_an_exposure_or_none(tmp_path):
+    known = sequence(T=2)
+    unknown = without_exposure(known)
+    for name, first, second, message in (
+        ("a", known, unknown, "sequence a, frame 1: exposure: frame 0 has one, this one has none; all frames"),
+        ("b", unknown, known, "sequence b, frame 1: exposure: frame 0 has none, this one has one; all frames"),
+    ):
+        writer = SequenceWriter(tmp_path, name)
+        write_frames(writer, first, [0], 0)
+        with pytest.raises(ValueError, match=message):
+            write_frames(writer, second, [1], 0)
+        write_frames(writer, first, [1], 0)
+        writer.finish()
+    path = tmp_path / "a" / "sequence.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["exposure"] = None
+    path.write_text(json.dumps(content))
+    with pytest.raises(
+        ValueError, match=r"a/sequence\.json: exposure: expected a number for all frames, or null for all"
+    ):
+        write_dataset(tmp_path, {"train": ["a"]})
+
+
 def test_invalid_content_is_refused_with_names(tmp_path):
     at = select_time(sequence(), 0)
     writer = SequenceWriter(tmp_path, "a")

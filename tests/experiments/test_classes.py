@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from essjax.data import write_dataset, write_sequence
+from essjax.exposure import exposed
 from essjax.frames import Prediction
 from essjax.interfaces import Method, MethodInfo
 from essjax.labels import ALIASING, GHOSTING, Thresholds, label_sequence
@@ -52,7 +53,7 @@ def oracle(shift):
         return history + 1, Prediction(image=jnp.zeros((*shape, 3)), aux=aux)
 
     info = MethodInfo("oracle", 2, renders_all=True)
-    return Method(lambda key, example: {}, lambda example: jnp.zeros((), jnp.int32), step, step, info)
+    return exposed(Method(lambda key, example: {}, lambda example: jnp.zeros((), jnp.int32), step, step, info))
 
 
 def test_scored_frames_are_compared():

@@ -87,6 +87,7 @@ class Painter(Runner):
 @pytest.mark.parametrize(("before", "same"), [(0.5, True), (0.50001, False), (np.nan, False)])
 def test_pictures_as_before_training(before, same):
     clip = Clip("a", {"t": np.zeros(20)}, (), [], np.zeros(0), True)  # type: ignore[arg-type]
+    clip.exposure = np.ones(20, np.float32)
     found = health.unchanged("dlctus", Painter(0.5), {"net": before, "frozen": 3}, clip)
     assert found == (["dlctus: it shows the same as before training."] if same else [])
 

@@ -17,6 +17,7 @@ from essjax.methods.classifier import (
     closeness,
     depth_difference,
     look,
+    map_colors,
     warp_history,
 )
 from essjax.rollout import SS, alternate, every, unroll
@@ -109,9 +110,10 @@ def test_the_class_says_what_becomes_of_history(untrained, logits):
     now = bicubic(first)
     np.testing.assert_allclose(reinhard(prediction.image), now, atol=2e-4)  # after a cut: the frame itself
     np.testing.assert_array_equal(history.counter, 0.0)
+    new, prediction = step(variables, history, second)
+    history, new = (map_colors(reinhard, h) for h in (history, new))  # as the steps see it
     np.testing.assert_allclose(history.low, now, atol=1e-5)
 
-    new, prediction = step(variables, history, second)
     then, now = np.clip(backward_warp(history.image, moved_motion(), mode="bicubic"), 0, 1), bicubic(second)
     samples = see(second, history.depth_scale).samples
     clamped = np.asarray(ycocg_to_rgb(jnp.clip(rgb_to_ycocg(then), samples.low, samples.high)))
@@ -137,6 +139,7 @@ def test_the_classifier_sees_what_the_paper_lists(untrained):
     frames = two_frames()
     first, second = select_time(frames, 0), select_time(frames, 1)
     history, _ = step(certain(untrained, (0.5, 0.25, 0.125)), METHOD.start(first), first)
+    history = map_colors(reinhard, history)
     history = dataclasses.replace(history, counter=history.counter + 3.0, high=history.high + 0.1)
     current = see(second, history.depth_scale)
     inputs = np.asarray(jax.jit(lambda h, c: classifier_inputs(c, warp_history(h, c)))(history, current))

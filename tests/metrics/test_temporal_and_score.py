@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from essjax.exposure import clip_exposure
 from essjax.metrics import (
     METRICS,
     aggregate,
@@ -64,7 +65,13 @@ def rollout():
     targets = random_image(0, T, H, W, 3, high=4.0)
     images = jnp.maximum(targets + random_image(1, T, H, W, 3, low=-0.3, high=0.3), 0.0)
     holes = jnp.zeros((T, H, W, 1)).at[:, 2:8, 3:7].set(1.0).at[4].set(0.0).at[4, 0, :15].set(1.0)
-    return {"images": images, "targets": targets, "holes": holes, "motion": jnp.zeros((T, H, W, 2))}
+    return {
+        "images": images,
+        "targets": targets,
+        "holes": holes,
+        "motion": jnp.zeros((T, H, W, 2)),
+        "exposure": jnp.ones(T),
+    }
 
 
 KINDS = ("ss", "ess", "ss", "ess", "ss")
@@ -160,6 +167,30 @@ def test_first_frame_and_missing_masks(rollout):
     assert bare["tpsnr"] > 0
     assert all(bare[name] is None for name in ("psnr_holes", "hole_share", "warped_error", "warped_error_reference"))
     assert score_rollout(**rollout, scored=[], kinds=KINDS) == {}
+
+
+def test_scores_do_not_depend_on_the_unit(rollout):
+    """Nor do they where no exposure is recorded: it is then 0.18 over the log-mean of the targets."""
+    score = lambda unit, exposure: score_rollout(
+        **{**rollout, "images": unit * rollout["images"], "targets": unit * rollout["targets"], "exposure": exposure},
+        scored=[3], kinds=EVERY,
+    )[3]  # fmt: skip
+    for one, others in ((score(1.0, 0.5), [score(1e-3, 500.0), score(1e4, 5e-5)]),
+                        (score(1.0, None), [score(1e-3, None), score(1e4, None)])):  # fmt: skip
+        for other in others:
+            for name in METRICS:
+                assert other[name] == pytest.approx(one[name], rel=1e-3), name
+    by_hand = score(1.0, clip_exposure(rollout["targets"]))
+    assert score(1.0, None) == by_hand and by_hand["psnr"] != pytest.approx(score(1.0, 1.0)["psnr"], abs=0.1)
+
+
+def test_a_frame_is_compared_at_its_own_exposure(rollout):
+    """Exposure that changes is no flicker: frame 2 is shown at frame 4's where they are compared."""
+    exposure = np.array([9.0, 9.0, 3.0, 1.0, 0.7])
+    rows = score_rollout(**{**rollout, "exposure": exposure}, scored=[2, 4], kinds=EVERY)
+    for n in (2, 4):
+        constant = score_rollout(**{**rollout, "exposure": exposure[n]}, scored=[n], kinds=EVERY)[n]
+        assert rows[n] == constant
 
 
 def test_aggregate_is_the_mean_of_what_is_there():

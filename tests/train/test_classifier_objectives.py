@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from essjax.color import reinhard
+from essjax.exposure import exposed
 from essjax.frames import Prediction
 from essjax.interfaces import Method, MethodInfo, Network
 from essjax.labels import Thresholds, label_sequence
@@ -29,7 +30,7 @@ def fake(aux_of):
         aux = aux_of(variables, history)
         return history + 1, Prediction(image=jnp.zeros((B, 2 * H, 2 * W, 3)), aux=aux)
 
-    return Method(lambda key, example: {}, start, step, step, MethodInfo("fake", 2, renders_all=True))
+    return exposed(Method(lambda key, example: {}, start, step, step, MethodInfo("fake", 2, renders_all=True)))
 
 
 @pytest.fixture(scope="module")

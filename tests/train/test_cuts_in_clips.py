@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax.exposure import exposed
 from essjax.frames import Prediction
 from essjax.interfaces import Network
 from essjax.losses import spatio_temporal
@@ -170,6 +171,7 @@ def test_dlctus_compares_nothing_across_a_cut():
         return history + 1, Prediction(image=encoded[history], aux={"encoded": encoded[history]})
 
     method = fake(lambda *_: {})._replace(render_step=render_step, start=lambda example: jnp.zeros((), jnp.int32))
+    method = exposed(method)
     clip = clip_of((T - 1, 0))
     still = dataclasses.replace(clip.frames, motion=jnp.zeros_like(clip.frames.motion), jitter=clip.frames.jitter * 0)
     clip = dataclasses.replace(clip, frames=still)

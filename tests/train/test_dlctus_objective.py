@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax.exposure import exposed
 from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods import dlctus
@@ -26,7 +27,9 @@ def fake():
         return history + 1, Prediction(image=encoded, aux={"encoded": encoded})
 
     info = MethodInfo("fake", 2, renders_all=True)
-    return Method(lambda key, example: {}, lambda example: jnp.zeros((), jnp.int32), render_step, render_step, info)
+    return exposed(
+        Method(lambda key, example: {}, lambda example: jnp.zeros((), jnp.int32), render_step, render_step, info)
+    )
 
 
 def clip_with(motion=(0.0, 0.0)):

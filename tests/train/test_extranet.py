@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from essjax.color import log1p
+from essjax.exposure import exposed
 from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods import extranet
@@ -37,7 +38,7 @@ def fake(shading, mask):
         return run
 
     start = lambda example: jnp.full((LOG, 2), -1.0)
-    return Method(lambda key, example: {}, start, step(0), step(1), MethodInfo("fake", 1))
+    return exposed(Method(lambda key, example: {}, start, step(0), step(1), MethodInfo("fake", 1)))
 
 
 def numbered(length):

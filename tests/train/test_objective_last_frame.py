@@ -9,6 +9,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from essjax.color import display
+from essjax.exposure import exposed
 from essjax.frames import Prediction
 from essjax.interfaces import Method, MethodInfo, Network
 from essjax.losses import census, feature_census
@@ -38,7 +39,7 @@ def fake(aux, seen):
 
         return run
 
-    return Method(lambda key, example: {}, start, step("ss"), step("ess"), MethodInfo("fake", 1))
+    return exposed(Method(lambda key, example: {}, start, step("ss"), step("ess"), MethodInfo("fake", 1)))
 
 
 def test_nsrr_terms_equal_skimage():
@@ -78,7 +79,7 @@ def test_nsrr_on_half_of_the_frames(length, rendered):
 
         return run
 
-    method = Method(lambda key, example: {}, start, step("ss"), step("ess"), MethodInfo("fake", 1))
+    method = exposed(Method(lambda key, example: {}, start, step("ss"), step("ess"), MethodInfo("fake", 1)))
     clip = clip_of(length)
     counted = {}
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax.exposure import exposed
 from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo, Network, reset_at_cut
 from essjax.losses import census, feature_census
@@ -44,7 +45,7 @@ def fake(step_aux):
 
         return run
 
-    return Method(lambda key, example: {}, start, step(0), step(1), MethodInfo("fake", 1))
+    return exposed(Method(lambda key, example: {}, start, step(0), step(1), MethodInfo("fake", 1)))
 
 
 @pytest.mark.parametrize("length", [3, 7])

@@ -73,7 +73,7 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
             far = float(record["CameraFarPlane"])
             return FrameFacts(
                 jitter=_jitter(record, index),
-                exposure=float(record.get("Exposure", 1.0)),
+                exposure=None if record.get("Exposure") is None else float(record["Exposure"]),
                 cut=bool(record.get("CameraCut", False)),
                 near=float(record["CameraNearPlane"]),
                 far=np.inf if far == -1 else far,

@@ -248,7 +248,6 @@ def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> Converted:
         motion=np.where(hit & ~mixed, vector, static).astype(np.float32),
         jitter=jitter,
         cut=np.asarray(number - 1 not in dump.cameras),
-        exposure=np.ones((), np.float32),
         camera=camera,
     )
     counts = {

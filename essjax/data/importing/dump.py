@@ -97,7 +97,7 @@ class RecipeClip:
             motion=motion,
             jitter=jitter,
             cut=np.asarray(cut),
-            exposure=np.asarray(facts.exposure, np.float32),
+            exposure=None if facts.exposure is None else np.asarray(facts.exposure, np.float32),
             camera=facts.camera,
             reactive=buffers.get("reactive"),
         )

@@ -22,7 +22,7 @@ class FrameFacts:
 
     Attributes:
       jitter: ``[2]`` in the recipe's unit and sign, or None.
-      exposure: colour was, or will be, multiplied with it.
+      exposure: colour was, or will be, multiplied with it; None: not known.
       cut: history is not valid.
       near: near plane, the dump's unit, or None.
       far: far plane, or None.
@@ -33,7 +33,7 @@ class FrameFacts:
     """
 
     jitter: np.ndarray | None = None
-    exposure: float = 1.0
+    exposure: float | None = None
     cut: bool = False
     near: float | None = None
     far: float | None = None
@@ -97,7 +97,7 @@ def generic_facts(path: Path, width: int, height: int) -> Facts:
         try:
             return FrameFacts(
                 jitter=None if "jitter" not in record else np.asarray(record["jitter"], np.float32).reshape(2),
-                exposure=float(record.get("exposure", 1.0)),
+                exposure=None if record.get("exposure") is None else float(record["exposure"]),
                 cut=bool(record.get("cut", False)),
                 near=None if record.get("near") is None else float(record["near"]),
                 far=None if record.get("far") is None else float(record["far"]),

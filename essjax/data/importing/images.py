@@ -69,6 +69,10 @@ def radiance(stored: np.ndarray, recipe: Recipe, facts: FrameFacts) -> tuple[np.
     color = stored * np.float32(recipe.scale.color)
     color = convert.srgb_to_linear(color) if recipe.color.encoding == "srgb" else color
     if recipe.color.pre_exposed:
+        if facts.exposure is None:
+            raise ValueError(
+                "color.pre_exposed is true, but the metadata has no exposure of this frame. Give it there."
+            )
         color = color / np.float32(facts.exposure)
     infinite = color == np.inf
     counts = {"negative": int(np.count_nonzero(stored < 0)), "infinite": int(np.count_nonzero(infinite))}

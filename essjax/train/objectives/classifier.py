@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from essjax.color import reinhard
+from essjax.color import expose, reinhard
 from essjax.frames import SampleRanges, Sequence
 from essjax.interfaces import Method, Network
 from essjax.labels import ALIASING, DEFAULTS, GHOSTING, Thresholds, label_sequence
@@ -42,10 +42,11 @@ def classification_objective(
     """
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
-        labels = label_sequence(required_ranges(clip), clip.frames.cut, thresholds)
-        keep = lambda aux: {"inputs": aux["inputs"], "known": aux["known"]}  # noqa: E731
+        ranges = required_ranges(clip)
+        keep = lambda aux: {name: aux[name] for name in ("inputs", "known", "exposure")}  # noqa: E731
         given = jax.lax.stop_gradient(variables)
         seen = jax.lax.stop_gradient(unroll(method, given, clip.frames, every(), keep=keep).aux[SS])
+        labels = label_sequence(ranges, clip.frames.cut, thresholds, exposure=seen["exposure"])
         inputs = seen["inputs"].reshape(-1, *seen["inputs"].shape[-3:])
         logits, state = network.apply(variables["classifier"], inputs, train=True)
         logits = logits.reshape(*seen["known"].shape[:-1], -1)
@@ -70,14 +71,15 @@ def composition_objective(method: Method, *, temporal_weight: float = 0.1) -> Ob
     """
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
-        keep = lambda aux: {name: aux[name] for name in ("encoded", "warped", "known")}  # noqa: E731
+        names = "encoded", "warped", "known", "exposure"
+        keep = lambda aux: {name: aux[name] for name in names}  # noqa: E731
         # Not train: a frozen classifier uses the statistics that it was trained to, and the rest has none.
         kept = unroll(method, variables, clip.frames, every(), keep=keep).aux[SS]
-        image, warped, valid = (kept[name][1:] for name in ("encoded", "warped", "known"))
+        image, warped, valid, exposure = (kept[name][1:] for name in names)
         if clip.valid is not None:
             valid = valid * nearest_upsample(jnp.asarray(clip.valid[1:]), clip.scale)
         terms = {
-            "l1": jnp.mean(l1(image, reinhard(clip.reference[1:]))),
+            "l1": jnp.mean(l1(image, reinhard(expose(clip.reference[1:], exposure)))),
             "temporal": temporal_weight * masked_mean(temporal_l1(image, warped, valid), valid),
         }
         return terms, {}

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from essjax.color import reinhard
+from essjax.color import expose, reinhard
 from essjax.frames import Sequence, select_time
 from essjax.interfaces import Method, expand_flag
 from essjax.losses import spatio_temporal
@@ -30,8 +30,10 @@ def dlctus_objective(method: Method, *, targets: int = 5, theta: float | None = 
         if length < 2:
             raise ValueError(f"clip: expected at least 2 frames, got {length}.")
         last = slice(max(length - targets, 1), length)
-        rollout = unroll(method, variables, clip.frames, every(), train=True, keep=lambda aux: aux["encoded"])
-        error = rollout.aux[SS][last.start - 1 :] - reinhard(clip.reference[last.start - 1 :])
+        keep = lambda aux: {name: aux[name] for name in ("encoded", "exposure")}  # noqa: E731
+        rollout = unroll(method, variables, clip.frames, every(), train=True, keep=keep)
+        shown = select_time(rollout.aux[SS], slice(last.start - 1, length))
+        error = shown["encoded"] - reinhard(expose(clip.reference[last.start - 1 :], shown["exposure"]))
         if theta is None:
             return {"l1": jnp.mean(jnp.abs(error[1:]))}, rollout.state
         frames = select_time(clip.frames, last)

@@ -4,7 +4,7 @@ Our reading, that of the published code: the losses compare the network's output
 log(1 + x), before base colour comes back. The frame is the jittered, aliased one.
 """
 
-from essjax.color import demodulate, log1p
+from essjax.color import demodulate, expose, log1p
 from essjax.frames import Sequence, rendered_color, select_time
 from essjax.interfaces import Method
 from essjax.losses import hardest, l1, masked_mean, occlusion
@@ -51,7 +51,7 @@ def extranet_objective(
         frames = select_time(clip.frames, slice(max(length - WINDOW, 0), length))
         prediction = predict_last(method, variables, frames)
         image = prediction.aux["log_shading"]
-        target = log1p(target_shading(select_time(clip, -1)))
+        target = log1p(expose(target_shading(select_time(clip, -1)), prediction.aux["exposure"]))
         counts = (since_cut(clip.frames.cut)[-1] > 0)[..., None, None, None]
         errors, hole = l1(image, target), (1.0 - prediction.aux["inputs"].mask) * counts
         terms = {

@@ -8,7 +8,7 @@ history). Losses are on log(1 + x).
 import jax
 import jax.numpy as jnp
 
-from essjax.color import expm1, log1p
+from essjax.color import expm1, expose, log1p
 from essjax.frames import Sequence, rendered_color
 from essjax.interfaces import Method, Network
 from essjax.losses import (
@@ -55,12 +55,14 @@ def frnet_objective(method: Method, network: Network, *, feature_weight: float =
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         clip = odd_length(clip)
-        kinds, state = both_kinds(method, variables, clip, keep=lambda aux: aux.get("extrapolated", {}))
+        keep = lambda aux: {name: aux[name] for name in ("extrapolated", "exposure") if name in aux}  # noqa: E731
+        kinds, state = both_kinds(method, variables, clip, keep)
         length = clip.frames.motion.shape[0]
         first = WITH_TWO_PICTURES if length > WITH_TWO_PICTURES + 1 else 1
-        predicted = jax.tree.map(lambda leaf: leaf[first - 1 :], kinds[ESS])  # kinds begin at frame 1
+        kept = jax.tree.map(lambda leaf: leaf[first - 1 :], kinds[ESS])  # kinds begin at frame 1
+        predicted, color = kept["extrapolated"], rendered_color(clip.frames, "frnet")[first:-1]
         counts = since_cut(clip.frames.cut)[first:-1] >= first
-        target = log1p(halve(rendered_color(clip.frames, "frnet")[first:-1]))
+        target = log1p(halve(expose(color, kept["exposure"])))
         # The target's features are given: learned from this side too, they shrink until nothing differs.
         features, _ = network.apply(jax.lax.stop_gradient(variables["frnet"]), target, method="encode")
         distances = [feature_census(a, b) for a, b in zip(predicted.features, features, strict=True)]
@@ -100,19 +102,20 @@ def extrass_objective(
     """
 
     def keep(aux: dict) -> dict:
-        return {name: aux[name] for name in ("log_image", "warped", "features")}
+        return {name: aux[name] for name in ("log_image", "warped", "features", "exposure")}
 
     def start(clip: Sequence) -> PyTree:
         return start_both_kinds(method, clip)
 
     def follow(variables: PyTree, clip: Sequence, history: PyTree) -> tuple[dict[str, Array], PyTree, PyTree]:
         kinds, state, history = follow_both_kinds(method, variables, clip, keep, history)
-        target, since = log1p(clip.reference[1:-1]), since_cut(clip.frames.cut)[1:-1]
+        since = since_cut(clip.frames.cut)[1:-1]
         weight = jnp.minimum((since + 1) / RAMP, 1.0)
         pixels = weight[..., None, None, None]
         terms: dict[str, Array] = {}
         for kind, predicted in kinds.items():
             image, warped = predicted["log_image"], predicted["warped"]
+            target = log1p(expose(clip.reference[1:-1], predicted["exposure"]))
             valid = warped.valid if clip.valid is None else nearest_upsample(clip.valid[1:-1], clip.scale)
             hole = (1 - valid) * (since > 0)[..., None, None, None]
             counts = jnp.where(since > 0, weight, 0.0) if kind == ESS else weight

@@ -1,6 +1,6 @@
 """What FASSET's training minimises (section 3.4): every inner frame of a clip as SS and as ESS, see ``both_kinds``."""
 
-from essjax.color import log1p
+from essjax.color import expose, log1p
 from essjax.frames import Sequence
 from essjax.interfaces import Method
 from essjax.losses import hardest, l1, masked_mean, occlusion
@@ -25,10 +25,12 @@ def fasset_objective(
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         clip = odd_length(clip)
-        kinds, state = both_kinds(method, variables, clip, lambda aux: {k: aux[k] for k in ("log_image", "valid")})
-        target, age = log1p(clip.reference[1:-1]), since_cut(clip.frames.cut)[1:-1]
+        keep = lambda aux: {name: aux[name] for name in ("log_image", "valid", "exposure")}  # noqa: E731
+        kinds, state = both_kinds(method, variables, clip, keep)
+        age = since_cut(clip.frames.cut)[1:-1]
         terms: dict[str, Array] = {}
         for kind, predicted in kinds.items():
+            target = log1p(expose(clip.reference[1:-1], predicted["exposure"]))
             errors = l1(predicted["log_image"], target)
             valid = predicted["valid"] if clip.valid is None else clip.valid[1:-1]
             hole = (1.0 - nearest_upsample(valid, clip.scale)) * (age > 0)[..., None, None, None]

@@ -2,7 +2,7 @@
 
 import jax
 
-from essjax.color import log1p
+from essjax.color import expose, log1p
 from essjax.frames import Sequence, rendered_color, select_time
 from essjax.interfaces import Method, Network
 from essjax.losses import census, charbonnier, feature_census
@@ -28,7 +28,7 @@ def ifrnet_objective(method: Method, network: Network, *, feature_weight: float 
         counts = since_cut(clip.frames.cut)[-1] >= 2
         prediction = predict_last(method, variables, frames, alternate(0))
         predicted = prediction.aux
-        target = log1p(rendered_color(frames, "ifrnet")[1])
+        target = log1p(expose(rendered_color(frames, "ifrnet")[1], predicted["exposure"]))
         # The target's features are given, as in ``frnet_objective``.
         given = jax.lax.stop_gradient(variables["ifrnet"])
         features, _ = network.apply(given, target - predicted["mean"], method="encode")

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from essjax.color import display
+from essjax.color import display, expose
 from essjax.frames import Sequence, select_time
 from essjax.interfaces import Method
 from essjax.losses import perceptual, ssim_map, sum_of_means
@@ -34,12 +34,15 @@ def nsrr_objective(
         clip = select_time(clip, slice(-length, None))
         schedule = alternate((clip.reference.shape[0] - 1) % 2) if half else every()
         prediction = predict_last(method, variables, clip.frames, schedule)
-        reference = clip.reference[-1]
+        exposure = prediction.aux["exposure"]
+        reference = expose(clip.reference[-1], exposure)
         # Not clipped to [0, 1]: where it is, no gradient would lead back.
         similarity = ssim_map(prediction.aux["display_image"], display(reference))
         terms: dict[str, Array] = {"dissimilarity": jnp.mean(1.0 - similarity)}
         if vgg_features is not None:
-            terms["vgg"] = vgg_weight * sum_of_means(perceptual(prediction.image, reference, vgg_features))
+            terms["vgg"] = vgg_weight * sum_of_means(
+                perceptual(expose(prediction.image, exposure), reference, vgg_features)
+            )
         return terms, prediction.state
 
     return objective

@@ -153,6 +153,7 @@ def test_everything_is_converted(dump, tmp_path):
     assert (buffers.base_color[:, 11, 19] == 0).all() and buffers.metallic.max() == 1
     np.testing.assert_array_equal(frames.color[0, 6, 6], [1, 0, 3])
     np.testing.assert_allclose(sequence.reference[2], np.full((2 * H, 2 * W, 3), 1.0), atol=5e-4)
+    assert frames.exposure is None  # Blender's files do not say it
     assert report.dynamic == (7,)
     assert report.totals == {"pixels": 6 * W * H, "background": 6 * 3 * W, "mixed": 6, "negative": 6, "clamped": 0}
 

@@ -257,6 +257,22 @@ def test_metadata_errors(tmp_path, odd):
         run()
 
 
+def test_exposure_is_recorded_where_the_metadata_has_it(tmp_path, odd):
+    """The colour of this dump is pre-exposed: without an exposure there is no radiance."""
+    write_odd(tmp_path / "dump", truth(T=2), "a")
+    path = tmp_path / "dump" / "a" / "shot.json"
+    content = json.loads(path.read_text())
+    for record in content["frames"].values():
+        del record["exposure"]
+    path.write_text(json.dumps(content))
+    message = "color.pre_exposed is true, but the metadata has no exposure of this frame"
+    with pytest.raises(ValueError, match=message):
+        import_dataset(tmp_path / "dump", tmp_path / "out", "generic", recipe=odd)
+    odd.write_text(odd.read_text().replace("pre_exposed = true", "pre_exposed = false"))
+    report = import_dataset(tmp_path / "dump", tmp_path / "out", "generic", recipe=odd)
+    assert imported(report, "a").frames.exposure is None
+
+
 def test_presets_and_the_examples_of_the_guide_load(tmp_path):
     for preset in ("extranet", "unreal", "arm-nss"):
         assert load_recipe(preset).motion.sign == "current-previous"

@@ -278,6 +278,17 @@ def test_arm_nss(tmp_path, reverse, far):
     assert report.dataset.splits == {"test": (("0007", 0, 3, 0), ("0008", 0, 3, 0))}
 
 
+def test_arm_without_an_exposure(tmp_path):
+    write_arm(tmp_path / "dump", truth())
+    path = next((tmp_path / "dump").rglob("0007.json"))
+    content = json.loads(path.read_text())
+    for record in content["Frames"]:
+        del record["Exposure"]
+    path.write_text(json.dumps(content))
+    report = import_dataset(tmp_path / "dump", tmp_path / "out", "arm-nss")
+    assert imported(report, "0007").frames.exposure is None
+
+
 @pytest.mark.parametrize(("ratio", "index"), [(1.5, 0), (2, 1)])
 def test_arm_jitter_of_the_frames_ratio(tmp_path, ratio, index):
     """The target's width says which ratio it is; and dilated motion is recorded."""
