@@ -21,8 +21,8 @@ class Config:
       no stage's learning rate decays), fresh (new train scenes after so many steps, rendered in the meantime;
       None: always those on disk), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
       of VGG-16 weights); average (decay of a moving average of the weights over the steps; None: the last weights) and
-      validations (how often in each stage, equally apart in its budget, the averaged weights play a few frames of each
-      validation clip: the best are kept; None: never, the last are).
+      validations (how often after the start of each stage, equally apart in its budget, the averaged weights play a
+      few frames of each validation clip: the best are kept; None: never, the last are).
     Evaluation: tune (search the TAA family's settings on validation frames, else their defaults), warmup (frames not
       scored at the start and after a cut), pictures (chosen frames per sequence).
     optimize: false compiles in half the time for slower code.

@@ -191,7 +191,7 @@ def run_experiment(
         "seconds": seconds,
         "training": {stage: {**found, "terms": {}} for stage, found in reports.items()},
         "dead": dead,
-        "warnings": health.few_steps(reports),
+        "warnings": health.few_steps(reports) + health.no_gain(reports),
         "costs": costs(runners, dataset),
         "rows": result["rows"],
     }

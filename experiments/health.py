@@ -9,7 +9,7 @@ import numpy as np
 
 from essjax.color import display, expose
 from essjax.rollout import alternate, every
-from essjax.train import best_validation
+from essjax.train import best_validation, mean_score
 from essjax.typing import PyTree
 from experiments.evaluate import Clip, Runner
 
@@ -38,11 +38,27 @@ def training_note(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _validations(validated: Sequence[Mapping[str, float]]) -> str:
-    if not validated:
+    if len(validated) < 2:  # not even after the start
         return ""
     best = validated[best_validation(list(validated))]
     scores = ", ".join(f"{kind.upper()} {value:.2f} dB" for kind, value in best.items() if kind != "step")
-    return f", kept as it was at step {best['step']}, the best of {len(validated)} validations ({scores})"
+    return f", kept as it was at step {best['step']}, the best of {len(validated) - 1} validations ({scores})"
+
+
+def no_gain(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A warning for each stage whose best validation is below that of its start."""
+    messages = []
+    for stage, found in reports.items():
+        validated = list(found["validated"])
+        if len(validated) < 2:
+            continue
+        before, after = (mean_score(validated[n]) for n in (0, best_validation(validated)))
+        if after < before - SAME_DECIBEL:
+            messages.append(
+                f"{stage}: on the validation frames it is at {after:.2f} dB, at its start it was at {before:.2f} dB: "
+                "this training did harm. Give it more steps or a smaller learning rate."
+            )
+    return messages
 
 
 def has_few_steps(reports: Mapping[str, Mapping[str, Any]]) -> bool:

@@ -8,6 +8,7 @@ from essjax.train.loop import (
     Validation,
     best_validation,
     chosen_variables,
+    mean_score,
     read_progress,
     restore_stage,
     train,
@@ -36,6 +37,6 @@ __all__ = [
     "averaged", "best_validation", "both_kinds", "chosen_variables", "classification_objective",
     "composition_objective", "constant", "cosine", "create_state", "dlctus_objective", "extranet_objective",
     "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective", "learning_rate",
-    "make_train_step", "nsrr_objective", "odd_length", "optimizer", "predict_last", "read_progress", "restore_stage",
-    "train",
+    "make_train_step", "mean_score", "nsrr_objective", "odd_length", "optimizer", "predict_last", "read_progress",
+    "restore_stage", "train",
 ]  # fmt: skip

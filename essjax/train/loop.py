@@ -32,7 +32,7 @@ class Validation(NamedTuple):
 
     Attributes:
       score: variables -> kind of frame -> PSNR, dB; the mean over kinds counts.
-      times: how often, equally apart in the budget; the last time is at its end.
+      times: how often behind the start, equally apart in the budget; the last time is at its end.
     """
 
     score: Callable[[PyTree], dict[str, float]]
@@ -94,8 +94,8 @@ def train(
     Returns:
       The variables that were best in validation, averaged where the state holds an average, and a summary of all runs
       together: ``steps``; ``seconds`` of training; ``compile_seconds`` and ``validation_seconds``; ``still``, how many
-      steps up to the last had a gradient of exactly zero; ``validated``, step and scores of each validation; ``terms``
-      of the last step.
+      steps up to the last had a gradient of exactly zero; ``validated``, step and scores of each validation, the first
+      of the start, which is not kept; ``terms`` of the last step.
 
     Raises:
       Interrupted: a signal came; everything is saved.
@@ -120,6 +120,19 @@ def train(
         def progress() -> float:
             return budget.progress(step, spent["seconds"])
 
+        def validate(validation: Validation) -> None:
+            nonlocal best
+            on_validation(step, progress(), {})
+            began, candidate = time.monotonic(), averaged(state, trained)
+            scores = validation.score(candidate)
+            spent["validated"].append({"step": step, **scores})
+            if best_validation(spent["validated"]) == len(spent["validated"]) - 1:
+                best = jax.tree.map(np.asarray, candidate[trained])
+            spent["validation_seconds"] += time.monotonic() - began
+            on_validation(step, progress(), scores)
+
+        if validation and not spent["validated"] and progress() < 1.0:
+            validate(validation)
         while progress() < 1.0 and not stop.set:
             began = time.monotonic()
             batch, rate = next(batches), schedule(step, progress())
@@ -137,15 +150,8 @@ def train(
             spent["still"] = 0 if terms["gradient_norm"] else spent["still"] + 1
             log.write(json.dumps({"step": step, "seconds": round(spent["seconds"], 2), **terms}) + "\n")
             on_step(step, progress(), terms)
-            if validation and int(progress() * validation.times) > len(spent["validated"]):
-                on_validation(step, progress(), {})
-                began, candidate = time.monotonic(), averaged(state, trained)
-                scores = validation.score(candidate)
-                spent["validated"].append({"step": step, **scores})
-                if best_validation(spent["validated"]) == len(spent["validated"]) - 1:
-                    best = jax.tree.map(np.asarray, candidate[trained])
-                spent["validation_seconds"] += time.monotonic() - began
-                on_validation(step, progress(), scores)
+            if validation and int(progress() * validation.times) >= len(spent["validated"]):
+                validate(validation)
             if time.monotonic() - last_save > save_every:
                 save()
                 last_save = time.monotonic()
@@ -165,19 +171,20 @@ def restore_stage(
 
 def chosen_variables(state: TrainState, best: PyTree, trained: str, progress: dict[str, Any]) -> PyTree:
     """The variables that a stage ends with: the best of its validations, without any the last (averaged) ones."""
-    if progress.get("validated"):
+    if len(progress.get("validated", ())) > 1:  # not the start alone
         return {**state.variables, trained: jax.tree.map(jnp.asarray, best)}
     return averaged(state, trained)
 
 
+def mean_score(scores: dict[str, float]) -> float:
+    """Of one validation: mean PSNR over kinds, minus infinity where it is not finite."""
+    value = float(np.mean([value for name, value in scores.items() if name != "step"]))
+    return value if np.isfinite(value) else -np.inf
+
+
 def best_validation(validated: list[dict[str, float]]) -> int:
-    """Index of the best: mean PSNR over kinds, not finite is the worst; of equally good ones the last."""
-
-    def mean(scores: dict[str, float]) -> float:
-        value = float(np.mean([value for name, value in scores.items() if name != "step"]))
-        return value if np.isfinite(value) else -np.inf
-
-    return max(range(len(validated)), key=lambda n: (mean(validated[n]), n))
+    """Index of the best ``mean_score`` behind the start; of equally good ones the last."""
+    return max(range(len(validated)), key=lambda n: (n > 0, mean_score(validated[n]), n))
 
 
 def read_progress(saved: dict[str, Any]) -> dict[str, Any]:

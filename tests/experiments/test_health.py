@@ -23,10 +23,23 @@ def test_how_long_it_trained():
         "extrassnet 250 steps in 45 s (waited 21 s to be compiled)."
     ]
     assert health.training_note({}) == []
-    validated = [{"step": step, "ess": psnr} for step, psnr in ((50, 22.0), (100, 22.126), (150, 22.1))]
+    validated = [{"step": step, "ess": psnr} for step, psnr in ((0, 23.0), (50, 22.0), (100, 22.126), (150, 22.1))]
     assert health.training_note({"frnet": {**report(150), "validated": validated}})[0].endswith(
         "(waited 21 s to be compiled), kept as it was at step 100, the best of 3 validations (ESS 22.13 dB)."
     )
+
+
+def test_a_training_that_did_harm():
+    start, worse, better = ({"step": n, "ss": psnr, "ess": 20.0} for n, psnr in enumerate((22.0, 21.9, 22.1)))
+    reports = {
+        "frnet": {**report(150), "validated": [start, worse]},
+        "net": {**report(150), "validated": [start, better, worse]},
+    }
+    reports |= {"never": report(150), "interrupted": {**report(1), "validated": [start]}}
+    assert health.no_gain(reports) == [
+        "frnet: on the validation frames it is at 20.95 dB, at its start it was at 21.00 dB: this training did harm. "
+        "Give it more steps or a smaller learning rate."
+    ]
 
 
 def test_few_steps():

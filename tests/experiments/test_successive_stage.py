@@ -35,7 +35,7 @@ def test_the_history_is_part_of_what_a_stage_starts_with_and_comes_back(tmp_path
         saved = dataclasses.replace(saved, variables=jax.tree.map(lambda leaf: leaf + 1.0, saved.variables))
         checkpoints = Checkpoints(tmp_path / "out" / "checkpoints" / stage.name)
         content = {"state": saved, "best": saved.variables[stage.name]}
-        checkpoints.save(3, content, {"seconds": 2.0, "validated": [{"step": 3, "ss": 20.0}]})
+        checkpoints.save(3, content, {"seconds": 2.0, "validated": [{"step": 0, "ss": 20.0}, {"step": 3, "ss": 20.0}]})
         checkpoints.close()
     restored, report = restore_stages(stages, dataset, config, tmp_path / "out", variables)
     assert report["extrassnet"]["steps"] == 0 and report["extrassnet"]["seconds"] == 2.0

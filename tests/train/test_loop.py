@@ -129,7 +129,7 @@ class Batches:
 def test_the_best_averaged_weights_are_kept(uninterrupted):
     """Steps 3, 6, 9 and 12 are validated; the score falls after its peak, so the last weights are not the best."""
     _, end = uninterrupted
-    assert [entry["step"] for entry in end["validated"]] == [3, 6, 9, 12]
+    assert [entry["step"] for entry in end["validated"]] == [0, 3, 6, 9, 12]
     scores = [entry["ss"] for entry in end["validated"]]
     score = tiny_run.validation().score
     np.testing.assert_allclose(score(end["variables"])["ss"], max(scores), rtol=1e-5)
@@ -148,12 +148,12 @@ def test_without_validation_the_average_is_kept(tmp_path, uninterrupted):
 
 
 def test_kill_in_a_validation_and_resume(tmp_path, uninterrupted):
-    """Nothing of a validation that was torn is left: here its second one raises, with a checkpoint after each step."""
+    """Nothing of a validation that was torn is left: here its third one raises, with a checkpoint after each step."""
     calls = []
 
     def score(variables):
         calls.append(len(calls))
-        if len(calls) == 2:
+        if len(calls) == 3:
             raise RuntimeError("killed")
         return tiny_run.validation().score(variables)
 
@@ -177,11 +177,11 @@ def test_kill_in_a_validation_and_resume(tmp_path, uninterrupted):
     ],
 )
 def test_the_best_validation(scores, best):
+    start = {"step": 0, "ss": 30.0, "ess": 30.0}  # never kept, however good
     validated = [{"step": 1000 - n, "ss": score, "ess": score} for n, score in enumerate(scores)]
-    assert best_validation(validated) == best
-    assert (
-        best_validation([{"step": 1, "ss": 20.0, "ess": 20.1}, {"step": 2, "ss": 30.0, "ess": 10.0}]) == 0
-    )  # the mean
+    assert best_validation([start, *validated]) == best + 1 and best_validation([start]) == 0
+    first, second = {"step": 1, "ss": 20.0, "ess": 20.1}, {"step": 2, "ss": 30.0, "ess": 10.0}
+    assert best_validation([start, first, second]) == 1  # the mean over kinds
 
 
 def test_validation_is_announced_and_not_on_the_clock(tmp_path):
@@ -190,8 +190,8 @@ def test_validation_is_announced_and_not_on_the_clock(tmp_path):
         tmp_path, validation=Validation(lambda variables: time.sleep(0.3) or {"ss": 1.0}, 2), budget=Budget(4, 0.5),
         on_validation=lambda step, progress, scores: events.append((step, scores)),
     )  # fmt: skip
-    assert events == [(2, {}), (2, {"ss": 1.0}), (4, {}), (4, {"ss": 1.0})]
-    assert summary["seconds"] < 0.5 and summary["validation_seconds"] > 0.6
+    assert events == [event for step in (0, 2, 4) for event in ((step, {}), (step, {"ss": 1.0}))]
+    assert summary["seconds"] < 0.5 and summary["validation_seconds"] > 0.9
 
 
 def test_clock_ends_a_stage(tmp_path):
