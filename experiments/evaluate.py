@@ -309,7 +309,7 @@ def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, image
             shown[key] = _new_picture(clip, n, kind, low)
         # Copies: views would keep all frames of all clips in memory.
         shown[key]["images"][name] = images[n].copy()
-        if n >= PHASES:
+        if shown[key]["previous"]:
             shown[key]["previous"][name] = images[n - PHASES].copy()
 
 
@@ -324,6 +324,10 @@ def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
         "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
         "exposure": float(clip.exposure[n]),
     }  # fmt: skip
+    starts = np.flatnonzero(np.asarray(clip.sequence.frames.cut)[: n + 1])
+    if rendered_last - PHASES < starts.max(initial=0):  # of another shot, or made of nothing
+        picture["previous"] = {}
+        del frames_of_part["previous"]
     for part, (frame, index) in frames_of_part.items():
         color = np.repeat(np.repeat(np.asarray(rendered[max(index, 0)]), scale, 0), scale, 1)
         picture[part] = {"input": color, "reference": np.array(target[max(frame, 0)])}

@@ -145,7 +145,7 @@ def _arrive(history: History, frame: Frame, scale: float, width: int) -> tuple[H
     )
     valid = jnp.where(empty, 0.0, same * last.valid)
     recent, trust = jnp.where(empty, 1.0, recent), jnp.where(empty, 0.0, jnp.ones_like(valid))
-    if frame.reactive is not None and last.trust is not None:
+    if frame.reactive is not None:
         valid, trust = valid * last.trust, trust * last.trust
         # What a reactive pixel shows is its own sample: nothing is cut out of it.
         recent = jnp.maximum(recent, frame.reactive)

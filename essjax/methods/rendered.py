@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from essjax.color import demodulate, demodulation_albedo, modulate, reinhard, reinhard_inverse
 from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
 from essjax.interfaces import expand_flag, reset_at_cut
+from essjax.methods.shots import check_masks, path_trust
 from essjax.typing import Array, Callable, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
-from essjax.warp import backward_warp, compose_motion, gbuffer_guided_warp, guides, jittered_motion
+from essjax.warp import compose_motion, gbuffer_guided_warp, guides, jittered_motion
 
 GUIDED = frozenset({"base_color", "normal"})
 """``MethodInfo.requires`` of every method that warps guided by G-buffers."""
@@ -80,6 +81,7 @@ def _remember(frame: Frame, content: PyTree) -> Rendered:
 
 def reset_memory(cut: Flag, fresh: Memory, memory: Memory) -> Memory:
     """``fresh`` where ``cut``: ``interfaces.reset_at_cut`` for leaves that carry the memory's axis in front."""
+    check_masks(memory.frames.trust, fresh.frames.trust)
 
     def choose(new: Array, old: Array) -> Array:
         return jnp.where(expand_flag(cut, new.ndim - 1), new, old)
@@ -103,10 +105,8 @@ def advance(memory: Memory, frame: Frame) -> Memory:
         jitter_previous=share(memory.jitter),
         valid_previous=previous.valid,
     )
-    trust = previous.trust
-    if frame.reactive is not None and trust is not None:
-        lookup = jittered_motion(share(frame.motion), share(frame.jitter), share(memory.jitter))
-        trust = (1.0 - frame.reactive) * backward_warp(trust, lookup, mode="nearest")
+    reactive = None if frame.reactive is None else share(frame.reactive)
+    trust = path_trust(previous.trust, reactive, share(jittered_motion(frame.motion, frame.jitter, memory.jitter)))
     frames = dataclasses.replace(previous, motion=motion, valid=valid, trust=trust)
     return dataclasses.replace(memory, frames=frames, jitter=frame.jitter)
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from essjax.exposure import metered
 from essjax.frames import Frame
 from essjax.interfaces import Method, expand_flag
-from essjax.typing import Color, Flag, Image, Mask, PyTree, pytree
-from essjax.warp import jitter_aligned_upsample
+from essjax.typing import Color, Flag, Image, Mask, Motion, PyTree, pytree
+from essjax.warp import backward_warp, jitter_aligned_upsample
 
 
 @pytree
@@ -52,6 +52,32 @@ def upsampled_reactive(frame: Frame, scale: int) -> Mask | None:
     if frame.reactive is None:
         return None
     return jitter_aligned_upsample(frame.reactive, scale, frame.jitter, mode="nearest")
+
+
+def check_masks(earlier: Mask | None, reactive: Mask | None) -> None:
+    """Raise a ValueError unless this frame has a reactive mask just as those before it: histories keep their shape."""
+    if (earlier is None) != (reactive is None):
+        raise ValueError(
+            f"reactive: expected a mask in every frame or in none, got {'none' if reactive is None else 'one'} after "
+            "others. Fill the missing ones with 0."
+        )
+
+
+def path_trust(earlier: Mask | None, reactive: Mask | None, motion: Motion) -> Mask | None:
+    """What reactive masks leave of a path that ``motion`` makes longer: 1 - reactive here, times what was left there.
+
+    Args:
+      earlier: of the path from the previous frame on, ``[..., H, W, 1]``; None where frames have no masks.
+      reactive: this frame's mask, the same size; or None.
+      motion: ``[..., H, W, 2]`` to the pixels of ``earlier``.
+
+    Raises:
+      ValueError: one of the two masks is missing.
+    """
+    check_masks(earlier, reactive)
+    if earlier is None or reactive is None:
+        return None
+    return (1.0 - reactive) * backward_warp(earlier, motion, mode="nearest")
 
 
 def without_history(history: Image, current: Image, frame: Frame, scale: int) -> Image:

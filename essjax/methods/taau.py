@@ -6,13 +6,14 @@ sample does not rule a pixel for many frames.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
-from essjax.methods.shots import upsampled_reactive, within_shots
+from essjax.methods.shots import path_trust, upsampled_reactive, within_shots
 from essjax.typing import Array, PyTree
 from essjax.warp import (
     Resampled,
@@ -80,11 +81,9 @@ def _output_motion(frame: Frame, settings: Settings) -> Array:
 def _path(history: PyTree, frame: Frame, settings: Settings) -> tuple[Array, Array | None]:
     """From this frame to the image in the history, at output resolution: motion, and what masks leave of it."""
     motion, reactive = _output_motion(frame, settings), upsampled_reactive(frame, settings.scale)
-    trust = None if reactive is None else 1.0 - reactive
     if "motion" not in history:  # every frame is rendered: the image is the previous frame's
-        return motion, trust
-    if trust is not None:
-        trust = trust * backward_warp(history["trust"], motion, mode="nearest")
+        return motion, None if reactive is None else 1.0 - reactive
+    trust = path_trust(history["trust"], reactive, motion)
     return motion + backward_warp(history["motion"], motion), trust
 
 
@@ -129,16 +128,14 @@ def _render_step(settings: Settings, variables: PyTree, history: PyTree, frame: 
     new = {"color": image, "count": total}
     if "motion" in history:
         new["motion"] = jnp.zeros_like(history["motion"])
-    if "trust" in history:
-        new["trust"] = jnp.ones_like(history["trust"])
+        new["trust"] = jax.tree.map(jnp.ones_like, history["trust"])
     return new, Prediction(image=image, aux={"rate": rate})
 
 
 def _warp_step(settings: Settings, history: PyTree, frame: Frame) -> tuple[PyTree, Prediction]:
     motion, trust = _path(history, frame, settings)
     image, _ = _reproject(history, motion, trust, frame, settings)
-    history = {**history, "motion": motion} if trust is None else {**history, "motion": motion, "trust": trust}
-    return history, Prediction(image=reinhard_inverse(image))
+    return {**history, "motion": motion, "trust": trust}, Prediction(image=reinhard_inverse(image))
 
 
 def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, half: bool, native: bool) -> Method:
@@ -160,8 +157,7 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
         history = {"color": jnp.zeros((*size, 3), jnp.float32), "count": jnp.zeros((*size, 1), jnp.float32)}
         if half:
             history["motion"] = jnp.zeros((*size, 2), jnp.float32)
-            if example.reactive is not None:
-                history["trust"] = jnp.ones((*size, 1), jnp.float32)
+            history["trust"] = None if example.reactive is None else jnp.ones((*size, 1), jnp.float32)
         return history
 
     def render_step(variables, history, frame, *, train=False):

@@ -66,6 +66,13 @@ def test_the_input_shows_what_was_rendered_last(clip, kind, now, before):
     np.testing.assert_array_equal(picture["previous"]["reference"], color[2])
 
 
+@pytest.mark.parametrize(("n", "kind"), [(7, "ss"), (7, "ess"), (8, "ess"), (2, "ess")])
+def test_what_precedes_the_shot_is_no_previous_picture(clip, n, kind):
+    """Frame 6 is a cut: as ESS, frame 8 would be compared with a picture made of nothing."""
+    assert _new_picture(clip, n, kind, low=True)["previous"] == {}
+    assert _new_picture(clip, 8, "ss", low=True)["previous"] and _new_picture(clip, 3, "ess", low=True)["previous"]
+
+
 def test_pictures_show_no_repeated_frame(clip):
     last = dataclasses.replace(clip, scored=[8])
     assert evaluate({"mean": Runner(MEAN, {})}, [last])["pictures"] == []

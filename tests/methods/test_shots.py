@@ -176,6 +176,19 @@ def test_nothing_crosses_a_cut(name):
                 np.testing.assert_array_equal(again[1:], first[1:])
 
 
+def test_a_metered_exposure_crosses_no_cut_either():
+    """Without a recorded exposure: from the first rendered frame on; before that only the last exposure is known."""
+    frames = dataclasses.replace(everything(), exposure=None)
+    for schedule in schedules("taau_half"):
+        kinds = schedule.kinds(T)
+        shown = run("taau_half", frames, kinds)
+        shown = shown.reshape(T, 6, len(POSITIONS), *shown.shape[2:])
+        for k, n in enumerate(POSITIONS):
+            start = n + (kinds[n] == ESS)
+            np.testing.assert_array_equal(shown[start:, 1, k], shown[start:, 0, k])
+            np.testing.assert_array_equal(shown[start:, 2, k], shown[start:, 0, k])
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_a_shot_without_a_rendered_frame_shows_its_base_colour(name):
     method = METHODS[name]
@@ -228,6 +241,14 @@ def test_extrass_extrapolates_reactive_pixels_without_its_last_output():
 def test_a_method_that_lags_is_refused():
     with pytest.raises(ValueError, match="within_shots: expected a method without latency, got bsr"):
         within_shots(methods.bsr())
+
+
+@pytest.mark.parametrize("name", ["extranet", "taau_half"])
+def test_masks_come_with_every_frame_or_with_none(name):
+    first, second = (select_time(scene(1), n) for n in range(2))
+    history = METHODS[name].start(dataclasses.replace(first, reactive=None))
+    with pytest.raises(ValueError, match="reactive: expected a mask in every frame or in none, got one after others"):
+        METHODS[name].extrapolate_step({}, history, without_color(second))
 
 
 def test_without_base_colour_it_is_black():
