@@ -10,7 +10,7 @@ import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
 from essjax.scenes import EXTRA_FAMILIES, FAMILIES, families_of, make_scene, render_frame, render_sequence, split_seeds
 
-RENDERER = "essjax.scenes 2"
+RENDERER = "essjax.scenes 3"
 """How datasets of the built-in renderer name it; the number grows when the same seed gives another picture."""
 UNSAID = {"jitter": "halton", "ranges": False}
 """Settings that a dataset names only if they differ from these: it may be older than the choice."""

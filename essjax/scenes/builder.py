@@ -23,6 +23,7 @@ class Scene:
       frames: how many.
       worlds: a ``World`` of NumPy arrays; animated leaves carry a leading time axis, see ``at``.
       cut: bool ``[T]``, true at frame 0 and where the camera jumps.
+      unit: what rendered radiance is multiplied with; its inverse is recorded as exposure.
     """
 
     family: str
@@ -30,6 +31,7 @@ class Scene:
     frames: int
     worlds: World
     cut: np.ndarray
+    unit: float = 1.0
 
     def at(self, index: int) -> World:
         """The world of frame ``index``."""
@@ -185,8 +187,8 @@ class Builder:
         self.camera = look_at(eye, target, roll)
         self.focal = np.broadcast_to(np.asarray(focal, float), (self.frames,))
 
-    def build(self, family: str, seed: int) -> Scene:
-        """The finished scene."""
+    def build(self, family: str, seed: int, *, unit: float = 1.0) -> Scene:
+        """The finished scene; ``unit`` as in ``Scene``."""
         to_local, to_world = np.zeros((2, self.frames, ROWS, 12))
         to_local[..., 3::4] = 9.0  # unused rows: a degenerate transform outside every shape, which no ray hits
         materials = np.zeros((ROWS, len(COLUMNS)))
@@ -208,4 +210,4 @@ class Builder:
             camera_to_world=single(self.camera), focal=single(self.focal), sky=single(self.sky),
             bounces=whole(self.bounces),
         )  # fmt: skip
-        return Scene(family=family, seed=seed, frames=self.frames, worlds=worlds, cut=self.cut)
+        return Scene(family=family, seed=seed, frames=self.frames, worlds=worlds, cut=self.cut, unit=unit)

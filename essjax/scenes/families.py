@@ -42,7 +42,17 @@ def make_scene(family: str, seed: int, frames: int) -> Scene:
     rng = np.random.default_rng([zlib.crc32(family.encode()), seed])
     builder = Builder(frames, rng)
     _MAKERS[family](builder)
-    return builder.build(family, seed)
+    return builder.build(family, seed, unit=radiance_unit(family, seed))
+
+
+def radiance_unit(family: str, seed: int) -> float:
+    """The unit of radiance of a scene, one of the powers of two over nearly four decades (1/128 to 64).
+
+    Other renderers have other units: what depends on it shows on built-in scenes, too. A power of two rounds nothing,
+    so pictures and scores are those of unit 1, and half precision holds all of them.
+    """
+    rng = np.random.default_rng([zlib.crc32(f"unit of {family}".encode()), seed])
+    return 2.0 ** int(rng.integers(-7, 7))
 
 
 def families_of(split: str) -> tuple[str, ...]:

@@ -35,12 +35,12 @@ def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray
     if scene.cut[index]:  # nothing of the frame before can be used
         images["valid"] = np.zeros_like(images["valid"])
     frame = Frame(
-        color=images["color"],
+        color=images["color"] * np.float32(scene.unit),
         gbuffers=gbuffers_of(images),
         motion=images["motion"],
         jitter=jitter,
         cut=np.asarray(scene.cut[index]),
-        exposure=np.ones((), np.float32),
+        exposure=np.asarray(1.0 / scene.unit, np.float32),
         camera=_camera(world, width, height),
     )
     return frame, images["valid"], images["steady"]
@@ -52,7 +52,8 @@ def render_frame(
 ) -> Sequence:  # fmt: skip
     """One frame of ``scene`` as a ``Sequence`` without time axis (leaves ``[H, W, C]``), NumPy arrays.
 
-    At a cut motion is that of a static scene seen by a static camera (zero) and ``valid`` is 0 everywhere.
+    Radiance is in the scene's ``unit``, and exposure its inverse. At a cut motion is that of a static scene seen by a
+    static camera (zero) and ``valid`` is 0 everywhere.
 
     Args:
       scene: from ``make_scene``.
@@ -81,9 +82,9 @@ def render_frame(
 
     def from_samples() -> tuple[np.ndarray, SampleRanges | None]:
         if not ranges:
-            return render_reference(world, wide, high, spp=spp), None
+            return render_reference(world, wide, high, spp=spp) * np.float32(scene.unit), None
         images = render_statistics(world, scene.before(index), wide, high, spp=spp)
-        return images["reference"], _ranges(images)
+        return images["reference"] * np.float32(scene.unit), _ranges(images, scene.unit)
 
     # Beside the buffers, so that the two compilations of the first frame run at the same time.
     with ThreadPoolExecutor(1) as beside:
@@ -96,8 +97,9 @@ def render_frame(
     return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame, ranges=found)
 
 
-def _ranges(images: dict[str, np.ndarray]) -> SampleRanges:
-    return SampleRanges(**{name: images[name] for name in RANGE_CHANNELS})
+def _ranges(images: dict[str, np.ndarray], unit: float) -> SampleRanges:
+    scales = {name: np.float32(unit) for name in ("color_min", "color_max")}
+    return SampleRanges(**{name: images[name] * scales.get(name, np.float32(1)) for name in RANGE_CHANNELS})
 
 
 def iterate_frames(
@@ -152,4 +154,4 @@ def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, s
       NumPy leaves ``[H, W, C]``; the background's normal counts as 0.
     """
     _check_size(width, height, 1, spp)
-    return _ranges(render_statistics(scene.at(index), scene.before(index), width, height, spp=spp))
+    return _ranges(render_statistics(scene.at(index), scene.before(index), width, height, spp=spp), scene.unit)

@@ -191,5 +191,5 @@ def test_look_at_and_exposure_and_camera_of_a_frame():
     np.testing.assert_allclose(s.frames.camera.center, [W / 2, H / 2])
     rotation = s.frames.camera.camera_to_world[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
-    assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-5) and s.frames.exposure == 1
+    assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-5) and s.frames.exposure == 1 / scene.unit
     assert look_at(np.zeros(3), np.array([0, 0, -1.0]))[2, 2] == pytest.approx(1.0)

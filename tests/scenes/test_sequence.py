@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -124,6 +126,23 @@ def test_mip_bias_blurs_frames_but_not_the_reference():
     np.testing.assert_array_equal(sharp.frames.motion, soft.frames.motion)
 
 
+def test_scenes_have_units_of_their_own_and_record_the_exposure():
+    units = {name: {scenes.make_scene(name, seed, 1).unit for seed in range(12)} for name in ("gloss", "plaza")}
+    everywhere = set.union(*units.values())
+    assert all(len(found) > 3 for found in units.values()) and max(everywhere) >= 256 * min(everywhere)
+    assert all(np.log2(unit) % 1 == 0 and 2.0**-7 <= unit < 2.0**7 for unit in everywhere)
+    scene = next(s for s in (scenes.make_scene("gloss", seed, 2) for seed in range(20)) if s.unit != 1)
+    plain = dataclasses.replace(scene, unit=1.0)
+    ours, same = (scenes.render_frame(s, 1, *SIZE, spp=4, native=True, ranges=True) for s in (scene, plain))
+    assert float(same.frames.exposure) == 1.0 and float(ours.frames.exposure) == 1.0 / scene.unit
+    for of in (lambda s: s.frames.color, lambda s: s.reference, lambda s: s.native.color,
+               lambda s: s.ranges.color_min, lambda s: s.ranges.color_max):  # fmt: skip
+        np.testing.assert_array_equal(of(ours) * ours.frames.exposure, of(same))
+    for of in (lambda s: s.frames.gbuffers, lambda s: s.frames.motion, lambda s: s.ranges.normal_spread):
+        leaves_equal(of(ours), of(same))
+    np.testing.assert_array_equal(ours.native.exposure, ours.frames.exposure)
+
+
 def test_reference_converges():
     """The mean of many randomly placed single samples is what the reference approaches."""
     world = scenes.make_scene("shadows", 2, 1).at(0)
@@ -146,7 +165,7 @@ def test_reference_converges():
 def test_statistics_bound_the_reference_and_bumps_add_spread():
     scene = scenes.make_scene("texture", 1, 2)
     frame = scenes.render_frame(scene, 1, *SIZE, scale=1, spp=16, ranges=True)
-    stats, reference = frame.ranges, render.render_reference(scene.at(1), *SIZE, spp=16)
+    stats, reference = frame.ranges, scene.unit * render.render_reference(scene.at(1), *SIZE, spp=16)
     leaves_equal(stats, scenes.subsample_statistics(scene, 1, *SIZE, spp=16))
     np.testing.assert_array_equal(frame.reference, reference)
     frames.validate_ranges(stats, 20, 36)
@@ -180,7 +199,7 @@ def gain(family, seed, index):
     now = scenes.render_frame(scene, index, width, height, scale=1, spp=16)
     mask = now.valid * now.steady
     warped = np.asarray(warp.backward_warp(before, now.frames.motion))
-    target = np.asarray(reinhard(now.reference))
+    target = np.asarray(reinhard(now.reference * now.frames.exposure))
     error = lambda image: (((np.asarray(reinhard(image)) - target) ** 2).mean(-1, keepdims=True) * mask).sum()
     motion = np.linalg.norm(now.frames.motion, axis=-1)[mask[..., 0] == 1]
     return 10 * np.log10(error(before) / error(warped)), np.median(motion), mask.mean()
