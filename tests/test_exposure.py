@@ -25,7 +25,7 @@ METHODS = {
 }  # fmt: skip
 COSTLY = {
     "tus": methods.tus(), "taa": methods.taa(), "bsr": methods.bsr(), "ifrnet": methods.ifrnet(width=4),
-    "dlctus": methods.dlctus(), "fasset": methods.fasset(width=3), "3d-warp": methods.warp_3d(),
+    "dlctus": methods.dlctus(), "fasset": methods.fasset(width=4, hidden=8), "3d-warp": methods.warp_3d(),
     "extrass-e": methods.extrass_e(width=8), "extrass": methods.extrass(width=8, frnet_width=8),
     "classifier": methods.classifier(width=8, composition_width=4), "nsrr": methods.nsrr(width=4),
     "extranet": methods.extranet(), "extranet-plus": methods.extranet_plus(),
