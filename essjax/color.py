@@ -78,9 +78,29 @@ def reinhard(color: Image) -> Image:
     return color / (1.0 + color)
 
 
-def log1p_of_reinhard(encoded: Image, *, limit: float = 0.9999) -> Image:
-    """log(1 + x) of ``encoded`` = x / (1 + x), which is -log(1 - encoded); clamped to [0, ``limit``] first."""
-    return -jnp.log1p(-jnp.clip(encoded, 0.0, limit))
+_REINHARD_LIMIT = 0.9999
+
+
+@jax.custom_vjp
+def log1p_of_reinhard(encoded: Image) -> Image:
+    """log(1 + x) of ``encoded`` = x / (1 + x), which is -log(1 - encoded); clamped to [0, 0.9999] first.
+
+    The gradient is computed from the output, exp(y), and 0 where clamped; see ``log1p``.
+    """
+    return -jnp.log1p(-jnp.clip(encoded, 0.0, _REINHARD_LIMIT))
+
+
+def _log1p_of_reinhard_forward(encoded):
+    result = -jnp.log1p(-jnp.clip(encoded, 0.0, _REINHARD_LIMIT))
+    return result, result
+
+
+def _log1p_of_reinhard_backward(result, gradient):
+    inside = (result > 0) & (result < -jnp.log1p(jnp.asarray(-_REINHARD_LIMIT, result.dtype)))
+    return (jnp.where(inside, gradient * jnp.exp(result), jnp.zeros_like(gradient)),)
+
+
+log1p_of_reinhard.defvjp(_log1p_of_reinhard_forward, _log1p_of_reinhard_backward)
 
 
 def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:

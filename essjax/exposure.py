@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from essjax.color import expose, sum_channels
 from essjax.frames import Frame
-from essjax.interfaces import Method, Step
+from essjax.interfaces import Method, Parts, Step, from_parts
 from essjax.typing import Array, Callable, Color, Flag, PyTree, Scalar, pytree
 
 GREY = 0.18
@@ -99,6 +99,8 @@ def metered(method: Method) -> Method:
 
     Frames with an exposure are passed on as they are, and the history is the method's own.
     """
+    if method.parts is not None:
+        return _metered_parts(method, method.parts)
 
     def assumed(example: Frame) -> Frame:
         return dataclasses.replace(example, exposure=jnp.ones(example.cut.shape, jnp.float32))
@@ -125,6 +127,37 @@ def metered(method: Method) -> Method:
     return Method(init, start, measuring(method.render_step), measuring(method.extrapolate_step), method.info)
 
 
+def _metered_parts(method: Method, parts: Parts) -> Method:
+    """The same of a method that is made of parts: its memory is ``Metered``."""
+
+    def assumed(example: Frame) -> Frame:
+        return dataclasses.replace(example, exposure=jnp.ones(example.cut.shape, jnp.float32))
+
+    def init(key, example):
+        return method.init(key, assumed(example) if example.exposure is None else example)
+
+    def start(example):
+        if example.exposure is not None:
+            return method.start(example)
+        history = method.start(assumed(example))
+        return dataclasses.replace(history, memory=Metered(meter=start_meter(example), history=history.memory))
+
+    def remember(memory, frame):
+        if frame.exposure is not None:
+            memory, notes = parts.remember(memory, frame)
+            return memory, (notes, None)
+        meter, exposure = read_meter(memory.meter, frame)
+        inner, notes = parts.remember(memory.history, dataclasses.replace(frame, exposure=exposure))
+        return Metered(meter=meter, history=inner), (notes, exposure)
+
+    def observe(variables, notes, frame):
+        notes, exposure = notes
+        frame = frame if exposure is None else dataclasses.replace(frame, exposure=exposure)
+        return parts.observe(variables, notes, frame)
+
+    return from_parts(init, start, Parts(remember, observe, parts.show), method.info)
+
+
 MapRadiance = Callable[[Callable[[Array], Array], PyTree], PyTree]
 """``(function, history) -> history`` with the function applied to each image of linear radiance in it."""
 
@@ -145,15 +178,11 @@ def exposed(method: Method, map_radiance: MapRadiance = _no_radiance) -> Method:
       map_radiance: where its history holds linear colour; what is kept in another form keeps the exposure of its frame.
     """
 
-    def inside(frame: Frame, exposure: Scalar) -> Frame:
-        color = None if frame.color is None else expose(frame.color, exposure)
-        return dataclasses.replace(frame, color=color, exposure=jnp.ones_like(exposure))
-
     def scaled(step: Step) -> Step:
         def run(variables, history, frame, *, train=False):
             up, down = frame.exposure, 1.0 / frame.exposure
             history = map_radiance(lambda image: expose(image, up), history)
-            history, prediction = step(variables, history, inside(frame, up), train=train)
+            history, prediction = step(variables, history, _exposed_frame(frame), train=train)
             history = map_radiance(lambda image: expose(image, down), history)
             image, aux = expose(prediction.image, down), {**prediction.aux, "exposure": up}
             return history, dataclasses.replace(prediction, image=image, aux=aux)
@@ -161,4 +190,40 @@ def exposed(method: Method, map_radiance: MapRadiance = _no_radiance) -> Method:
         return run
 
     steps = {"render_step": scaled(method.render_step), "extrapolate_step": scaled(method.extrapolate_step)}
-    return metered(method._replace(**steps))
+    return metered(method._replace(parts=None, **steps))
+
+
+def _exposed_frame(frame: Frame) -> Frame:
+    color = None if frame.color is None else expose(frame.color, frame.exposure)
+    return dataclasses.replace(frame, color=color, exposure=jnp.ones_like(frame.exposure))
+
+
+def exposed_parts(method: Method, map_memory: MapRadiance, map_shown: MapRadiance) -> Method:
+    """``exposed`` of a method that is made of parts.
+
+    Args:
+      method: as for ``exposed``.
+      map_memory: as ``map_radiance``, of the memory alone.
+      map_shown: of what was shown.
+    """
+    parts = method.parts
+    assert parts is not None
+
+    def remember(memory, frame):
+        up, down = frame.exposure, 1.0 / frame.exposure
+        memory = map_memory(lambda image: expose(image, up), memory)
+        memory, notes = parts.remember(memory, _exposed_frame(frame))
+        return map_memory(lambda image: expose(image, down), memory), notes
+
+    def observe(variables, notes, frame):
+        return parts.observe(variables, notes, _exposed_frame(frame)), frame.exposure
+
+    def show(variables, shown, seen, *, train):
+        seen, up = seen
+        shown = map_shown(lambda image: expose(image, up), shown)
+        shown, prediction = parts.show(variables, shown, seen, train=train)
+        shown = map_shown(lambda image: expose(image, 1.0 / up), shown)
+        image, aux = expose(prediction.image, 1.0 / up), {**prediction.aux, "exposure": up}
+        return shown, dataclasses.replace(prediction, image=image, aux=aux)
+
+    return metered(from_parts(method.init, method.start, Parts(remember, observe, show), method.info))

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from essjax.frames import Frame, Prediction
-from essjax.typing import Array, Flag, Key, PyTree
+from essjax.frames import Frame, Prediction, rendered_color, without_color
+from essjax.typing import Array, Callable, Flag, Key, PyTree, pytree
 
 
 class Step(Protocol):
@@ -60,6 +60,36 @@ class MethodInfo(NamedTuple):
     renders_all: bool = False
 
 
+class Parts(NamedTuple):
+    """The three parts of a method's steps; a rollout that trains takes the first two out of the loop that it trains.
+
+    ``frame.color`` is None in what is not rendered. A step is one after the other, see ``from_parts``.
+
+    Attributes:
+      remember: ``(memory, frame) -> (memory, notes)``: what frames leave for later ones; cheap, no networks.
+      observe: ``(variables, notes, frame) -> seen``: all else that does not depend on the method's earlier output, of
+        one frame or, with a time axis in front of all leaves, of many at once.
+      show: ``(variables, shown, seen, *, train) -> (shown, Prediction)``: what depends on it.
+    """
+
+    remember: Callable[[PyTree, Frame], tuple[PyTree, PyTree]]
+    observe: Callable[[PyTree, PyTree, Frame], PyTree]
+    show: Callable[..., tuple[PyTree, Prediction]]
+
+
+@pytree
+class Parted:
+    """The history of a method that is made of ``Parts``.
+
+    Attributes:
+      memory: what ``remember`` carries on.
+      shown: what ``show`` carries on.
+    """
+
+    memory: PyTree
+    shown: PyTree
+
+
 class Method(NamedTuple):
     """A pair of pure steps with what they need.
 
@@ -69,6 +99,7 @@ class Method(NamedTuple):
       render_step: for a frame with colour (SS).
       extrapolate_step: for a frame without (ESS).
       info: see ``MethodInfo``.
+      parts: of the steps where they have such; None after a change to the steps alone.
     """
 
     init: Init
@@ -76,6 +107,7 @@ class Method(NamedTuple):
     render_step: Step
     extrapolate_step: Step
     info: MethodInfo
+    parts: Parts | None = None
 
 
 class Network(NamedTuple):
@@ -88,6 +120,25 @@ class Network(NamedTuple):
 
     init: Any
     apply: Any
+
+
+def from_parts(init: Init, start: Start, parts: Parts, info: MethodInfo) -> Method:
+    """A method whose steps are its parts, one after the other; ``start`` gives a ``Parted``."""
+
+    def step(variables: PyTree, history: Parted, frame: Frame, train: bool) -> tuple[Parted, Prediction]:
+        memory, notes = parts.remember(history.memory, frame)
+        seen = parts.observe(variables, notes, frame)
+        shown, prediction = parts.show(variables, history.shown, seen, train=train)
+        return Parted(memory=memory, shown=shown), prediction
+
+    def render_step(variables, history, frame, *, train=False):
+        rendered_color(frame, info.name)
+        return step(variables, history, frame, train)
+
+    def extrapolate_step(variables, history, frame, *, train=False):
+        return step(variables, history, without_color(frame), train)
+
+    return Method(init, start, render_step, extrapolate_step, info, parts)
 
 
 def expand_flag(flag: Flag, ndim: int) -> Array:

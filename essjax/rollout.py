@@ -1,12 +1,13 @@
 """Unroll a method over a sequence: one ``lax.scan``, the same for training, evaluation and benchmarks."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from essjax.frames import Frame, check_dtypes, check_shapes, require, select_time, without_color
-from essjax.interfaces import Method, no_variables
+from essjax.interfaces import Method, Parted, Parts, no_variables
 from essjax.networks import compute_dtype
 from essjax.typing import Array, Callable, PyTree, pytree
 
@@ -136,7 +137,10 @@ def unroll(
     if pairs:
         body = jax.tree.map(lambda leaf: leaf.reshape(pairs, schedule.period, *leaf.shape[1:]), body)
         body_kinds = kinds[schedule.lead : schedule.lead + schedule.period]
-        history, collected = jax.lax.scan(lambda history, chunk: run_all(history, chunk, body_kinds), history, body)
+        if train and method.parts is not None:
+            history, collected = _scan_parts(method.parts, variables, history, body, body_kinds, keep, remat)
+        else:
+            history, collected = jax.lax.scan(lambda history, chunk: run_all(history, chunk, body_kinds), history, body)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), collected))
     history, collected = run_all(history, rest, kinds[body_end:])
     joined = _join([*parts, collected])
@@ -147,6 +151,36 @@ def unroll(
     # Each step started from the same old statistics, so their mean has seen every step alike.
     state = jax.tree.map(lambda leaf: leaf.mean(axis=0), joined["state"])
     return Rollout(image=images, aux=joined["aux"], history=history, state=state)
+
+
+def _scan_parts(parts: Parts, variables: PyTree, history: Parted, body: Frame, kinds: tuple[str, ...], keep, remat):
+    """The scan of ``unroll`` in training, ``body`` ``[periods, frames of a period, ...]``: all frames are observed at
+    once, so that the loop that gradients go through holds only what depends on earlier output.
+    """
+
+    def frame_of(frames: Frame, n: int) -> Frame:
+        return frames if kinds[n] == SS else without_color(frames)
+
+    def remember(memory, chunk):
+        notes = []
+        for n in range(len(kinds)):
+            memory, note = parts.remember(memory, frame_of(select_time(chunk, n), n))
+            notes.append(note)
+        return memory, notes
+
+    def show(shown, seen):
+        outputs = []
+        for each in seen:
+            step = partial(parts.show, train=True)
+            shown, prediction = (jax.checkpoint(step) if remat else step)(variables, shown, each)
+            outputs.append((prediction.image, keep(prediction.aux), prediction.state))
+        return shown, _collect(outputs, kinds)
+
+    memory, notes = jax.lax.scan(remember, history.memory, body)
+    frames = [frame_of(jax.tree.map(lambda leaf, n=n: leaf[:, n], body), n) for n in range(len(kinds))]
+    seen = [parts.observe(variables, note, frame) for note, frame in zip(notes, frames, strict=True)]
+    shown, collected = jax.lax.scan(show, history.shown, seen)
+    return Parted(memory=memory, shown=shown), collected
 
 
 Collected = dict[str, dict[str, PyTree]]

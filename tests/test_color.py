@@ -109,6 +109,15 @@ def test_the_gradient_of_log1p_needs_only_its_output():
     np.testing.assert_allclose(curvature, -1 / 16, rtol=1e-5)
 
 
+def test_the_gradient_of_log1p_of_reinhard_needs_only_its_output():
+    """1 / (1 - e) by hand, 0 where clamped."""
+    encoded = jnp.array([-0.5, 0.0, 0.2, 0.75, 0.99, 1.0, 2.0])
+    result, backward = jax.vjp(color.log1p_of_reinhard, encoded)
+    np.testing.assert_allclose(result[2:5], np.log1p(np.array([0.25, 3.0, 99.0])), rtol=1e-5)
+    np.testing.assert_allclose(backward(jnp.full(7, 2.0))[0], [0, 0, 2.5, 8, 200, 0, 0], rtol=1e-4)
+    np.testing.assert_array_equal(jax.tree.leaves(backward), [result])
+
+
 def test_strict_numerics(strict_numerics):
     image = random_image(0, 2, 3, 3)
     for encode, decode, _ in PAIRS.values():

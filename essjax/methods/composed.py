@@ -114,6 +114,7 @@ def settled(method: Method) -> Method:
         init=no_variables,
         render_step=with_own(method.render_step),
         extrapolate_step=with_own(method.extrapolate_step),
+        parts=None,
     )
 
 

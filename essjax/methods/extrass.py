@@ -9,22 +9,23 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import expm1, log1p, log1p_of_reinhard, reinhard, rgb_to_ycocg, ycocg_to_rgb
-from essjax.exposure import exposed
+from essjax.exposure import exposed_parts
 from essjax.frames import (
     Frame,
     GBuffers,
     Prediction,
     depth_scale,
     network_depth,
-    rendered_color,
     require,
     surface_guides,
+    without_color,
 )
-from essjax.interfaces import Method, MethodInfo, reset_at_cut
-from essjax.methods.extrass_low import extrapolate, frnet_inputs
+from essjax.interfaces import Method, MethodInfo, Parted, Parts, from_parts, reset_at_cut
+from essjax.methods.extrass_low import Extrapolated, extrapolate, frnet_inputs
 from essjax.methods.rendered import (
     GUIDED,
     Memory,
+    Rendered,
     advance,
     hole_buffers,
     map_shading,
@@ -32,10 +33,10 @@ from essjax.methods.rendered import (
     reset_pair,
     start_pair,
 )
-from essjax.methods.shots import within_shots, without_history
+from essjax.methods.shots import fade, upsampled_reactive, within_shots
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import nearest_upsample
-from essjax.typing import Array, Color, Image, Jitter, Mask, pytree
+from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, pytree
 from essjax.warp import (
     Resampled,
     backward_warp,
@@ -51,22 +52,67 @@ from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
 
 
 @pytree
-class History:
-    """The recurrent state of ``extrass``.
+class Past:
+    """What earlier frames leave, whatever was shown of them.
 
     Attributes:
       rendered: the two latest rendered LR frames.
-      image: last HR output, linear, ``[..., sH, sW, 3]``.
       gbuffers: of the last frame, rendered or not: those that marking holes needs.
       jitter: of the last frame.
       depth_scale: unit of depth, ``[...]``.
     """
 
     rendered: Memory
-    image: Color
     gbuffers: GBuffers
     jitter: Jitter
     depth_scale: Array
+
+
+@pytree
+class Notes:
+    """What of it concerns the current frame.
+
+    Attributes:
+      rendered: the two latest rendered frames with their paths from the current one, newest first; None if that is
+        rendered itself.
+      count: how many there are, ``[...]``.
+      gbuffers: of the frame before, see ``Past``.
+      jitter: of the frame before.
+      depth_scale: unit of depth, ``[...]``.
+    """
+
+    rendered: tuple[Rendered, Rendered] | None
+    count: Array
+    gbuffers: GBuffers
+    jitter: Jitter
+    depth_scale: Array
+
+
+@pytree
+class Seen:
+    """All that a frame brings, before what was shown is looked at.
+
+    Attributes:
+      cut: whether it begins a shot, ``[...]``.
+      reactive: its mask at the output's pixels, or None.
+      motion: to the last output, ``[..., sH, sW, 2]`` HR pixels.
+      valid: see ``Warped``.
+      valid_low: see ``Warped``.
+      low: inputs of E0 or E1 that are LR, ``[..., H, W, C]``.
+      current: the LR colour (log1p) resampled to the HR grid.
+      prior: logit of its share before training, ``[..., sH, sW, 1]``.
+      extrapolated: where that colour comes from if the frame is not rendered.
+    """
+
+    cut: Flag
+    reactive: Mask | None
+    motion: Motion
+    valid: Mask
+    valid_low: Mask
+    low: Image
+    current: Resampled
+    prior: Array
+    extrapolated: Extrapolated | None
 
 
 @pytree
@@ -84,21 +130,24 @@ class Warped:
     valid_low: Mask
 
 
-def warp_history(history: History, frame: Frame, scale: int) -> Warped:
-    """Backward warp of the HR output and where it may be trusted (f_r of eq 10)."""
+def history_motion(frame: Frame, scale: int) -> Motion:
+    """Where each HR pixel was in the last output, ``[..., sH, sW, 2]`` HR pixels."""
     # Dilated, so that the history of a silhouette moves with the surface in front.
-    motion = upsample_motion(dilate_motion(frame.motion, frame.gbuffers.depth), scale, jitter=frame.jitter)
-    valid_low = hole_mask(
-        frame.gbuffers, history.gbuffers, frame.motion, jitter=frame.jitter, jitter_previous=history.jitter
-    )
-    valid_low = _mean_of_nine(valid_low)  # softly: at silhouettes a mask is half wrong
-    valid_low = jnp.where(frame.cut[..., None, None, None], 0.0, valid_low)
-    if frame.reactive is not None:
-        valid_low = valid_low * (1.0 - frame.reactive)
-    valid = nearest_upsample(valid_low, scale) * inside_mask(motion)
+    return upsample_motion(dilate_motion(frame.motion, frame.gbuffers.depth), scale, jitter=frame.jitter)
+
+
+def trusted(frame: Frame, gbuffers: GBuffers, jitter: Jitter) -> Mask:
+    """Where history may be trusted, ``[..., H, W, 1]`` in [0, 1]; ``gbuffers`` and ``jitter`` of the frame before."""
+    valid = hole_mask(frame.gbuffers, gbuffers, frame.motion, jitter=frame.jitter, jitter_previous=jitter)
+    valid = _mean_of_nine(valid)  # softly: at silhouettes a mask is half wrong
+    valid = jnp.where(frame.cut[..., None, None, None], 0.0, valid)
+    return valid if frame.reactive is None else valid * (1.0 - frame.reactive)
+
+
+def warp_shown(image: Color, motion: Motion) -> Color:
+    """The last output, linear, along ``motion``; returns log1p."""
     # Bicubic: bilinear would blur the history a little more with every frame. Of x / (1 + x): bright pixels would ring.
-    image = log1p_of_reinhard(backward_warp(reinhard(history.image), motion, mode="bicubic"))
-    return Warped(log_image=image, valid=jax.lax.stop_gradient(valid), valid_low=jax.lax.stop_gradient(valid_low))
+    return log1p_of_reinhard(backward_warp(reinhard(image), motion, mode="bicubic"))
 
 
 def _mean_of_nine(mask: Mask) -> Mask:
@@ -129,19 +178,19 @@ CLAMP_LOGIT = 0.5
 """Logit of how far history is moved into the box of the current samples, before training."""
 
 
-def _compose(head: Array, warped: Warped, current: Resampled, weight: Array | float, scale: int) -> Image:
-    """Blend history and ``current`` (both log1p, HR) by the corrected prior and add the residual.
+def _compose(head: Array, warped: Color, seen: Seen, scale: int) -> Image:
+    """Blend warped history and the current colour (both log1p, HR) by the corrected prior and add the residual.
 
     TAA clamps history to the YCoCg box of the current samples: ghosts go, and so does detail finer than the samples.
     How far to go there is the network's choice.
     """
-    output = depth_to_space(head, scale)
-    share = jax.nn.sigmoid(_prior(warped.valid, weight) + output[..., :1])
+    output, current = depth_to_space(head, scale), seen.current
+    share = jax.nn.sigmoid(seen.prior + output[..., :1])
     clamping = jax.nn.sigmoid(CLAMP_LOGIT + output[..., 1:2])
     # One channel each: fused with the blend they would be computed for each of its three.
     share, clamping = jax.lax.optimization_barrier((share, clamping))
-    clamped = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped.log_image), current.low, current.high))
-    history = warped.log_image + clamping * (clamped - warped.log_image)
+    clamped = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped), current.low, current.high))
+    history = warped + clamping * (clamped - warped)
     return history + share * (current.color - history) + output[..., 2:]
 
 
@@ -168,99 +217,97 @@ def extrass(
     flow_network, network = frnet(frnet_width), extrassnet(width, scale)
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
-    def start(example: Frame) -> History:
-        image = nearest_upsample(jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32), scale)
-        return History(
+    def start(example: Frame) -> Parted:
+        past = Past(
             rendered=start_pair(example),
-            image=image,
             gbuffers=jax.tree.map(jnp.copy, hole_buffers(example.gbuffers)),  # a streaming step donates its history
             jitter=jnp.copy(example.jitter),
             depth_scale=depth_scale(example.gbuffers),
         )
-
-    def reset(frame: Frame, history: History) -> History:
-        fresh = start(frame)
-        rendered = reset_pair(frame, history.rendered)
-        rest = reset_at_cut(
-            frame.cut, dataclasses.replace(fresh, rendered=None), dataclasses.replace(history, rendered=None)
-        )
-        return dataclasses.replace(rest, rendered=rendered)
+        image = nearest_upsample(jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32), scale)
+        return Parted(memory=past, shown=image)
 
     def init(key, example):
         require(example, sorted(GUIDED), info.name)
         key_flow, key_net = jax.random.split(key)
+        flow = flow_network.init(key_flow, *frnet_inputs(example))
 
-        def both_inputs(example):
-            history, color = start(example), jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32)
-            warped = warp_history(history, example, scale)
-            return [_inputs(example, history, warped, color, extra)[0] for extra in _extras(example, color)]
+        def inputs(flow, frame):
+            history = start(frame)
+            seen = observe({"frnet": flow}, remember(history.memory, frame)[1], frame)
+            return _inputs(seen, history.shown)
 
-        inputs = jax.eval_shape(both_inputs, example)  # only shapes matter
-        return {
-            "frnet": flow_network.init(key_flow, *frnet_inputs(example)),
-            "extrassnet": network.init(key_net, *inputs),
-        }
+        rendered = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
+        kinds = [jax.eval_shape(inputs, flow, frame) for frame in (rendered, without_color(example))]
+        return {"frnet": flow, "extrassnet": network.init(key_net, *kinds)}  # only shapes matter
 
-    def _extras(frame: Frame, warp: Color) -> tuple[list[Image], list[Image]]:
-        return [], [log1p(warp), surface_guides(frame.gbuffers)[0]]
-
-    def _inputs(frame: Frame, history: History, warped: Warped, color: Color, extra: list[Image]):
-        """Inputs of E0 or E1 at LR, the LR colour (log1p) resampled to the HR grid, and the usable history."""
-        encoded = log1p(color)
-        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), scale)
-        # Before the network sees it: what is reactive may not reach the output at all.
-        kept = without_history(warped.log_image, current.color, frame, scale)
-        warped = dataclasses.replace(warped, log_image=kept)
-        shape = frame.gbuffers.depth.shape[:-1]
-        low = [
-            encoded,
-            network_depth(frame.gbuffers, history.depth_scale),
-            warped.valid_low,
-            jnp.broadcast_to(frame.jitter[..., None, None, :], (*shape, 2)),
-            *extra,
-        ]
-        high = [space_to_depth(current.color, scale), space_to_depth(warped.log_image, scale)]
-        return jnp.concatenate([*high, *low], axis=-1), current, warped
-
-    def _finish(history: History, frame: Frame, rendered: Memory, log_image: Image) -> tuple[History, Color]:
-        image = expm1(log_image)
-        history = dataclasses.replace(
-            history,
-            rendered=rendered,
-            image=image,
+    def remember(past: Past, frame: Frame) -> tuple[Past, Notes]:
+        pair = advance(reset_pair(frame, past.rendered), frame)
+        unit = reset_at_cut(frame.cut, depth_scale(frame.gbuffers), past.depth_scale)
+        newest, older = (jax.tree.map(lambda leaf, k=k: leaf[k], pair.frames) for k in (0, 1))
+        notes = Notes(
+            rendered=(newest, older) if frame.color is None else None,
+            count=pair.count,
+            gbuffers=past.gbuffers,
+            jitter=past.jitter,
+            depth_scale=unit,
+        )
+        past = Past(
+            rendered=pair if frame.color is None else push_pair(pair, frame),
             gbuffers=hole_buffers(frame.gbuffers),
             jitter=frame.jitter,
+            depth_scale=unit,
         )
-        return history, image
+        return past, notes
 
-    def render_step(variables, history, frame, *, train=False):
-        history = reset(frame, history)
-        warped = warp_history(history, frame, scale)
-        color = rendered_color(frame, info.name)
-        inputs, current, warped = _inputs(frame, history, warped, color, _extras(frame, color)[0])
-        (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="render")
-        weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98)
-        log_image = _compose(head, warped, current, weight, scale)
-        rendered = push_pair(advance(history.rendered, frame), frame)
-        history, image = _finish(history, frame, rendered, log_image)
+    def observe(variables, notes: Notes, frame: Frame) -> Seen:
+        color, extrapolated, extra = frame.color, None, []
+        if notes.rendered is not None:
+            pair = jax.tree.map(lambda *frames: jnp.stack(frames), *notes.rendered)
+            extrapolated = extrapolate(flow_network, variables["frnet"], pair, notes.count, frame, sigmas)
+            color, extra = extrapolated.image, [log1p(extrapolated.warp), surface_guides(frame.gbuffers)[0]]
+        assert color is not None
+        encoded = log1p(color)
+        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), scale)
+        motion, valid_low = history_motion(frame, scale), trusted(frame, notes.gbuffers, notes.jitter)
+        valid_low = jax.lax.stop_gradient(valid_low)
+        valid = nearest_upsample(valid_low, scale) * inside_mask(motion)
+        weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98) if extrapolated is None else EXTRAPOLATED_SHARE
+        jitter = jnp.broadcast_to(frame.jitter[..., None, None, :], (*encoded.shape[:-1], 2))
+        low = [encoded, network_depth(frame.gbuffers, notes.depth_scale), valid_low, jitter, *extra]
+        return Seen(
+            cut=frame.cut,
+            reactive=upsampled_reactive(frame, scale),
+            motion=motion,
+            valid=valid,
+            valid_low=valid_low,
+            low=jnp.concatenate(low, axis=-1),
+            current=current,
+            prior=_prior(valid, weight),
+            extrapolated=extrapolated,
+        )
+
+    def _inputs(seen: Seen, warped: Color) -> Image:
+        high = [space_to_depth(seen.current.color, scale), space_to_depth(warped, scale)]
+        return jnp.concatenate([*high, seen.low], axis=-1)
+
+    def show(variables, image: Color, seen: Seen, *, train: bool):
+        # Before the network sees it: what is reactive may not reach the output at all.
+        log_warped = fade(warp_shown(image, seen.motion), seen.current.color, seen.reactive, seen.cut)
+        encode = "render" if seen.extrapolated is None else "extrapolate"
+        inputs = _inputs(seen, log_warped)
+        (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method=encode)
+        log_image = _compose(head, log_warped, seen, scale)
+        warped = Warped(log_image=log_warped, valid=seen.valid, valid_low=seen.valid_low)
         aux = {"log_image": log_image, "warped": warped, "features": features}
-        return history, Prediction(image=image, aux=aux)
+        if seen.extrapolated is not None:
+            aux["extrapolated"] = seen.extrapolated
+        image = expm1(log_image)
+        return image, Prediction(image=image, aux=aux)
 
-    def extrapolate_step(variables, history, frame, *, train=False):
-        history = reset(frame, history)
-        warped = warp_history(history, frame, scale)
-        rendered = advance(history.rendered, frame)
-        low = extrapolate(flow_network, variables["frnet"], rendered, frame, sigmas)
-        inputs, current, warped = _inputs(frame, history, warped, low.image, _extras(frame, low.warp)[1])
-        (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method="extrapolate")
-        log_image = _compose(head, warped, current, EXTRAPOLATED_SHARE, scale)
-        history, image = _finish(history, frame, rendered, log_image)
-        aux = {"log_image": log_image, "warped": warped, "features": features, "extrapolated": low}
-        return history, Prediction(image=image, aux=aux)
-
-    def map_radiance(function, history):
-        rendered = map_shading(function, history.rendered)
-        return dataclasses.replace(history, image=function(history.image), rendered=rendered)
+    def map_memory(function, past: Past) -> Past:
+        return dataclasses.replace(past, rendered=map_shading(function, past.rendered))
 
     info = MethodInfo("extrass", scale=scale, requires=GUIDED)
-    return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance))
+    method = from_parts(init, start, Parts(remember, observe, show), info)
+    return within_shots(exposed_parts(method, map_memory, lambda function, image: function(image)))

@@ -13,6 +13,7 @@ from essjax.interfaces import Method, MethodInfo, Network, no_variables
 from essjax.methods.rendered import (
     GUIDED,
     Memory,
+    Rendered,
     advance,
     guided_extrapolation,
     map_shading,
@@ -129,18 +130,21 @@ class Extrapolated:
     mask: Mask
 
 
-def extrapolate(network: Network, variables: PyTree, pair: Memory, frame: Frame, sigmas: dict) -> Extrapolated:
+def extrapolate(
+    network: Network, variables: PyTree, pair: Rendered, count: Array, frame: Frame, sigmas: dict
+) -> Extrapolated:
     """Warp the two latest rendered frames to ``frame`` and refine them (sections 4.2, 4.3).
 
     Args:
       network: FRNet.
       variables: its variables.
-      pair: the rendered frames, advanced to ``frame``.
+      pair: the rendered frames, their paths from ``frame``; the newest first, ``[2, ...]``.
+      count: how many were rendered, ``[...]``.
       frame: the current one, its colour unread.
       sigmas: of the guided warp, keyword arguments of ``guided_extrapolation``.
     """
     # Rendered frames carry no parameters: without stop_gradient the warps' backward pass would be computed for nothing.
-    warped = jax.lax.stop_gradient(guided_extrapolation(pair.frames, pair.count, frame, **sigmas))
+    warped = jax.lax.stop_gradient(guided_extrapolation(pair, count, frame, **sigmas))
     refined = refine(network, variables, warped, frame.gbuffers)
     return Extrapolated(warp=warped[0], **refined)
 
@@ -178,7 +182,7 @@ def extrass_e(
 
     def extrapolate_step(variables, history, frame, *, train=False):
         history = advance(reset_pair(frame, history), frame)
-        result = extrapolate(network, variables["frnet"], history, frame, sigmas)
+        result = extrapolate(network, variables["frnet"], history.frames, history.count, frame, sigmas)
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
     info = MethodInfo("extrass-e", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))

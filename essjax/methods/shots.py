@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from essjax.exposure import metered
 from essjax.frames import Frame
-from essjax.interfaces import Method, expand_flag
+from essjax.interfaces import Method, Parted, Parts, expand_flag, from_parts
 from essjax.typing import Color, Flag, Image, Mask, Motion, PyTree, pytree
 from essjax.warp import backward_warp, jitter_aligned_upsample
 
@@ -89,11 +89,15 @@ def without_history(history: Image, current: Image, frame: Frame, scale: int) ->
       frame: its mask and whether it is a cut.
       scale: output size over input size.
     """
-    reactive = upsampled_reactive(frame, scale)
+    return fade(history, current, upsampled_reactive(frame, scale), frame.cut)
+
+
+def fade(history: Image, current: Image, reactive: Mask | None, cut: Flag) -> Image:
+    """``without_history`` of a frame with this mask at the output's pixels (``upsampled_reactive``)."""
     if reactive is not None:
         mixed = (1.0 - reactive) * history + reactive * current
         history = jnp.where(reactive < 1.0, mixed, current)  # at 1 nothing is left, not even NaN
-    return jnp.where(expand_flag(frame.cut, current.ndim), current, history)
+    return jnp.where(expand_flag(cut, current.ndim), current, history)
 
 
 def continued(frame: Frame, empty: Flag) -> Frame:
@@ -117,6 +121,9 @@ def within_shots(method: Method) -> Method:
     if method.info.latency:
         raise ValueError(f"within_shots: expected a method without latency, got {method.info.name}.")
 
+    if method.parts is not None:
+        return _parts_within_shots(method, method.parts)
+
     def start(example: Frame) -> Shot:
         return Shot(inner=method.start(example), empty=jnp.ones(example.cut.shape, bool))
 
@@ -133,3 +140,34 @@ def within_shots(method: Method) -> Method:
         return Shot(inner=inner, empty=seen.cut), dataclasses.replace(prediction, image=image)
 
     return metered(method._replace(start=start, render_step=render_step, extrapolate_step=extrapolate_step))
+
+
+def _parts_within_shots(method: Method, parts: Parts) -> Method:
+    """The same of a method that is made of parts."""
+
+    def start(example: Frame) -> Parted:
+        history = method.start(example)
+        empty = jnp.ones(example.cut.shape, bool)
+        return dataclasses.replace(history, memory=Shot(inner=history.memory, empty=empty))
+
+    def remember(memory, frame):
+        seen = continued(frame, memory.empty)
+        inner, notes = parts.remember(memory.inner, seen)
+        empty = seen.cut if frame.color is None else jnp.zeros_like(memory.empty)
+        return Shot(inner=inner, empty=empty), (notes, seen.cut)
+
+    def observe(variables, notes, frame):
+        notes, cut = notes
+        seen = parts.observe(variables, notes, dataclasses.replace(frame, cut=cut))
+        return seen, (cut, unlit(frame, method.info.scale)) if frame.color is None else None
+
+    def show(variables, shown, seen, *, train):
+        seen, fallback = seen
+        shown, prediction = parts.show(variables, shown, seen, train=train)
+        if fallback is not None:
+            cut, image = fallback
+            image = jnp.where(expand_flag(cut, image.ndim), image, prediction.image)
+            prediction = dataclasses.replace(prediction, image=image)
+        return shown, prediction
+
+    return metered(from_parts(method.init, start, Parts(remember, observe, show), method.info))

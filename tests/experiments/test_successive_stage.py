@@ -29,7 +29,7 @@ def test_the_history_is_part_of_what_a_stage_starts_with_and_comes_back(tmp_path
     batch = first_batch(dataset, config, last)
     state = initial_state(stages, last, config, variables, batch)
     assert initial_state(stages, flow, config, variables, first_batch(dataset, config, flow)).history is None
-    assert state.history.inner.image.shape == (2, 2, 48, 64, 3)  # both runs
+    assert state.history.shown.shape == (2, 2, 48, 64, 3)  # both runs
     for stage in stages:
         saved = initial_state(stages, stage, config, variables, batch)
         saved = dataclasses.replace(saved, variables=jax.tree.map(lambda leaf: leaf + 1.0, saved.variables))

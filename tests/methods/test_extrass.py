@@ -11,9 +11,9 @@ import pytest
 from essjax.color import demodulate, display, log1p, modulate, reinhard, reinhard_inverse
 from essjax.frames import GBuffers, select_time, without_color
 from essjax.methods import extrass, extrass_e, extrass_w
-from essjax.methods.extrass import warp_history
+from essjax.methods.extrass import history_motion, trusted, warp_shown
 from essjax.methods.extrass_low import blend_mask, refine
-from essjax.methods.rendered import albedo
+from essjax.methods.rendered import albedo, hole_buffers
 from essjax.networks import frnet
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
 from essjax.warp import gbuffer_guided_warp, guides
@@ -272,8 +272,7 @@ def test_history_beside_a_lamp_does_not_ring():
     height, width = frame.motion.shape[-3:-1]
     frame = dataclasses.replace(frame, motion=jnp.full_like(frame.motion, 0.25), cut=jnp.zeros_like(frame.cut))
     image = jnp.ones((frame.motion.shape[0], 2 * height, 2 * width, 3)).at[:, 9, 11].set(1000.0)
-    history = dataclasses.replace(extrass(width=8).start(frame).inner, image=image)
-    warped = jax.jit(functools.partial(warp_history, scale=2))(history, frame).log_image
+    warped = jax.jit(lambda image, frame: warp_shown(image, history_motion(frame, 2)))(image, frame)
     assert float(jnp.expm1(warped).min()) > 0.7
     assert float(jnp.expm1(warped[:, 9, 11]).max()) < 1000
 
@@ -286,7 +285,34 @@ def test_trust_is_soft_beside_a_hole():
         still.gbuffers, depth=jnp.full_like(still.gbuffers.depth, 10.0)))  # fmt: skip
     before = dataclasses.replace(still, gbuffers=dataclasses.replace(
         still.gbuffers, depth=still.gbuffers.depth.at[:, 5, 6].set(2.0)))  # fmt: skip
-    valid = warp_history(extrass(width=8).start(before).inner, still, 2).valid_low[0, ..., 0]
+    valid = trusted(still, hole_buffers(before.gbuffers), before.jitter)[0, ..., 0]
     expected = np.ones(valid.shape)
     expected[4:7, 5:8] = 8 / 9
     np.testing.assert_allclose(valid, expected, rtol=1e-5)
+
+
+def test_training_observes_all_frames_before_its_loop(busy):
+    """Images, what losses read, history and gradients are those of the steps, one frame at a time; with cuts inside."""
+    frames = random_frames(4, T=5)
+    frames = dataclasses.replace(frames, cut=frames.cut.at[2, 0].set(True).at[3, 1].set(True))
+    stepwise = METHOD._replace(parts=None)
+
+    def run(method, variables, frames):
+        def loss(network):
+            keep = lambda aux: {name: aux[name] for name in ("log_image", "warped", "features")}
+            result = unroll(method, {**variables, "extrassnet": network}, frames, alternate(0), train=True, keep=keep)
+            return jnp.mean(log1p(result.image)), result
+
+        return jax.grad(loss, has_aux=True)(variables["extrassnet"])
+
+    (gradient, result), (gradient_of_steps, steps) = (
+        jax.jit(functools.partial(run, method))(busy, frames) for method in (METHOD, stepwise)
+    )
+    assert str(jax.make_jaxpr(functools.partial(run, METHOD))(busy, frames)) != str(
+        jax.make_jaxpr(functools.partial(run, stepwise))(busy, frames)
+    )
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), result, steps)
+    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradient_of_steps))
+    jax.tree.map(
+        functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5 * largest), gradient, gradient_of_steps
+    )

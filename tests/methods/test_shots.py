@@ -231,7 +231,7 @@ def test_extrass_extrapolates_reactive_pixels_without_its_last_output():
     history, _ = steps("extrass")[SS](
         variables, METHODS["extrass"].start(select_time(frames, 0)), select_time(frames, 0)
     )
-    other = dataclasses.replace(history, inner=dataclasses.replace(history.inner, image=history.inner.image + 1.0))
+    other = dataclasses.replace(history, shown=history.shown + 1.0)
     for reactive, same in ((0.0, False), (1.0, True)):
         given = dataclasses.replace(second, reactive=jnp.full_like(second.reactive, reactive))
         first, changed = (steps("extrass")[ESS](variables, h, given)[1] for h in (history, other))

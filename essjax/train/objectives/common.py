@@ -178,4 +178,4 @@ def _unseen(method: Method) -> Method:
         return run
 
     steps = {"render_step": silent(method.render_step), "extrapolate_step": silent(method.extrapolate_step)}
-    return method._replace(**steps)
+    return method._replace(parts=None, **steps)
