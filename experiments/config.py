@@ -88,7 +88,7 @@ PRESETS: dict[str, Config] = {
         validations=100, pictures=2,
     ),
 }  # fmt: skip
-"""smoke: every part runs once, two minutes on two cores. quick: the default, seven minutes. paper: the
+"""smoke: every part runs once, two minutes on two cores. quick: the default, ten minutes. paper: the
 papers' settings (an epoch: one crop from each of 120 sequences' 60 frames, 900 batches of 8 or 600 of 12)."""
 
 PRESET_NAMES = tuple(PRESETS)
