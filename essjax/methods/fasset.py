@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from essjax import networks
 from essjax.cameras import pixel_positions
-from essjax.color import demodulate, expm1, log1p, modulate
+from essjax.color import demodulate, expm1, log1p, modulate, rgb_to_ycocg, ycocg_to_rgb
 from essjax.exposure import exposed
 from essjax.frames import (
     Frame,
@@ -39,7 +39,7 @@ from essjax.methods.rendered import (
 )
 from essjax.methods.shots import within_shots
 from essjax.networks.fasset import LOCAL, PAST
-from essjax.typing import Array, Color, Image, Jitter, Mask, Scalar, pytree
+from essjax.typing import Array, Callable, Color, Image, Jitter, Mask, Scalar, pytree
 from essjax.warp import (
     backward_warp,
     dilate_motion,
@@ -183,6 +183,28 @@ def _as_far_as(mask: Mask, image: Image) -> Image:
     return jnp.where(mask > 0, mask * image, 0.0)
 
 
+def _into_box(image: Color, samples: Color, jitter: Jitter, scale: float) -> Color:
+    """``image`` clamped to the YCoCg box of the 3x3 samples around each output pixel, as TAA does.
+
+    Reflections and shadows move without motion vectors; a network that saw few of them trusts their history.
+    """
+    box = rgb_to_ycocg(samples)
+    low, high = (
+        jitter_aligned_upsample(_around(box, choose), scale, jitter, mode="nearest")
+        for choose in (jnp.minimum, jnp.maximum)
+    )
+    return ycocg_to_rgb(jnp.clip(rgb_to_ycocg(image), low, high))
+
+
+def _around(image: Image, choose: Callable[[Array, Array], Array]) -> Image:
+    """The smallest or largest value of each 3x3 neighbourhood, the border repeated."""
+    for axis in (-3, -2):
+        size = image.shape[axis]
+        before, after = (jnp.clip(jnp.arange(size) + step, 0, size - 1) for step in (-1, 1))
+        image = choose(choose(jnp.take(image, before, axis), image), jnp.take(image, after, axis))
+    return image
+
+
 def sample_nearness(height: int, width: int, scale: float, jitter: Jitter) -> Mask:
     """How near each output pixel is to the nearest sample, a Gaussian of ``SAMPLE_SIGMA`` output pixels: (0, 1].
 
@@ -257,7 +279,8 @@ def fasset(
         texture = albedo(frame.gbuffers)
         filled = log1p(modulate(expm1(fill_holes(shading, mask)), texture))
         base = jax.lax.stop_gradient(jitter_aligned_upsample(filled, scale, frame.jitter))
-        difference = _as_far_as(arrival.known, arrival.image - base)
+        past = _into_box(arrival.image, jax.lax.stop_gradient(filled), frame.jitter, scale)
+        difference = _as_far_as(arrival.known, past - base)
         trusted = jitter_aligned_upsample(arrival.valid, scale, frame.jitter, mode="nearest")
         inputs = (
             mask * filled,

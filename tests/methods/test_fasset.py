@@ -283,14 +283,15 @@ def test_the_hidden_state_follows_the_motion(busy, kinds):
     assert np.abs(np.asarray(hidden_state(alone))[:, 9:-9, 9:-9] - states[0]).max() > 1e-3  # it has a memory at all
 
 
-def without_motion(frames, **changes):
+def without_motion(frames):
     """One flat surface that stands still, seen at each frame's own jitter."""
     gbuffers = GBuffers(
         base_color=frames.gbuffers.base_color,
         normal=jnp.zeros_like(frames.gbuffers.normal),
         depth=jnp.full_like(frames.gbuffers.depth, 5.0),
     )
-    return dataclasses.replace(frames, gbuffers=gbuffers, motion=jnp.zeros_like(frames.motion), **changes)
+    jitter = random_image(20, *frames.jitter.shape, low=-0.5, high=0.5)
+    return dataclasses.replace(frames, gbuffers=gbuffers, motion=jnp.zeros_like(frames.motion), jitter=jitter)
 
 
 def with_layer(variables, path, **leaves):
@@ -321,15 +322,21 @@ def test_a_hidden_state_that_is_kept_does_not_see_the_jitter(busy):
 
 
 def test_history_is_read_at_output_size(untrained):
-    """Share 1: every output is the first one, to the last pixel, whatever the jitter."""
+    """Share 1, the same samples at other places: every output is the first one, to the last pixel."""
     frames = without_motion(random_frames(13))
+    frames = dataclasses.replace(
+        frames, color=jnp.broadcast_to(frames.color[0], frames.color.shape), jitter=0.4 * frames.jitter
+    )
     share = jnp.array([40.0, 0.0, 0.0, 0.0])
     all_of_it = jax.tree.map(jnp.copy, untrained)
     all_of_it["fasset"]["params"]["inr"]["Dense_3"]["bias"] = share
-    images = stream(METHOD, all_of_it, frames, (SS, ESS, SS, ESS))
+    images = stream(METHOD, all_of_it, frames, (SS,) * T)
     for image in images[1:]:
         np.testing.assert_allclose(image, images[0], rtol=1e-4, atol=1e-4)
     assert float(jnp.abs(stream(METHOD, untrained, frames, (SS, SS))[1] - images[0]).max()) > 0.1
+    # History is no farther off than the current samples: where they are all alike nothing of it is left.
+    plain = dataclasses.replace(frames, color=frames.color.at[1].set(0.7))
+    np.testing.assert_allclose(stream(METHOD, all_of_it, plain, (SS, SS))[1], 0.7, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", [SS, ESS])
