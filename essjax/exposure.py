@@ -94,6 +94,13 @@ class Metered:
     history: PyTree
 
 
+def _assumed(example: Frame) -> Frame:
+    """``example`` with an exposure, 1 where it has none: for what only depends on shapes."""
+    if example.exposure is not None:
+        return example
+    return dataclasses.replace(example, exposure=jnp.ones(example.cut.shape, jnp.float32))
+
+
 def metered(method: Method) -> Method:
     """``method``, whose frames need an exposure, for frames without one: it is metered from those rendered so far.
 
@@ -102,16 +109,13 @@ def metered(method: Method) -> Method:
     if method.parts is not None:
         return _metered_parts(method, method.parts)
 
-    def assumed(example: Frame) -> Frame:
-        return dataclasses.replace(example, exposure=jnp.ones(example.cut.shape, jnp.float32))
-
     def init(key, example):
-        return method.init(key, assumed(example) if example.exposure is None else example)
+        return method.init(key, _assumed(example))
 
     def start(example):
         if example.exposure is not None:
             return method.start(example)
-        return Metered(meter=start_meter(example), history=method.start(assumed(example)))
+        return Metered(meter=start_meter(example), history=method.start(_assumed(example)))
 
     def measuring(step: Step) -> Step:
         def run(variables, history, frame, *, train=False):
@@ -130,16 +134,13 @@ def metered(method: Method) -> Method:
 def _metered_parts(method: Method, parts: Parts) -> Method:
     """The same of a method that is made of parts: its memory is ``Metered``."""
 
-    def assumed(example: Frame) -> Frame:
-        return dataclasses.replace(example, exposure=jnp.ones(example.cut.shape, jnp.float32))
-
     def init(key, example):
-        return method.init(key, assumed(example) if example.exposure is None else example)
+        return method.init(key, _assumed(example))
 
     def start(example):
         if example.exposure is not None:
             return method.start(example)
-        history = method.start(assumed(example))
+        history = method.start(_assumed(example))
         return dataclasses.replace(history, memory=Metered(meter=start_meter(example), history=history.memory))
 
     def remember(memory, frame):
