@@ -13,10 +13,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from essjax.builtin import generate, plan
 from essjax.data import Dataset, ImportReport, import_dataset
 from essjax.data.check import CheckReport, check_dataset
 from essjax.data.layout import read_dataset, write_json
-from essjax.generate import generate, plan
 
 _console = Console()
 

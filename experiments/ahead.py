@@ -4,8 +4,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 
+from essjax.builtin import Clip, live_source
 from essjax.frames import Sequence, select_time
-from essjax.generate import Clip, live_source
 from essjax.train import TrainState
 from essjax.typing import Array
 from experiments.config import Config

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from essjax.builtin import Clip, generate, plan
 from essjax.data import Dataset, read_dataset
-from essjax.generate import Clip, generate, plan
 from experiments.config import Config
 
 ROUNDS = 10_000

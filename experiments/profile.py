@@ -6,8 +6,8 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
+from essjax.builtin import generate, plan
 from essjax.frames import select_time, without_color
-from essjax.generate import generate, plan
 from essjax.rollout import ESS, SS, stream_step
 from essjax.train import create_state, make_train_step, optimizer
 from experiments.config import Config

@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from essjax.builtin import RENDERER, live_source
 from essjax.data import CachedSource, Rounds, clips, disk_source, successive_clips
 from essjax.data.layout import Dataset
 from essjax.frames import Sequence, select_time
-from essjax.generate import RENDERER, live_source
 from essjax.train import (
     Checkpoints,
     Recurrent,

@@ -17,7 +17,7 @@ from essjax.rollout import SS, check_supported
 from essjax.typing import Array
 from experiments.config import Config
 from experiments.evaluate import Clip, frame_with_batch_axis, schedules
-from experiments.variants import Variant
+from experiments.variants.base import Variant
 
 ALPHAS = (0.1, 0.2, 0.4, 0.7, 1.0)
 SIGMAS = (0.4, 0.5, 0.65, 0.8, 1.0)  # as many: one compilation serves both

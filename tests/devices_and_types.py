@@ -11,6 +11,7 @@ import numpy as np  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 from essjax import methods, rollout, warp  # noqa: E402
+from essjax.frames import select_time  # noqa: E402
 from essjax.networks.convolution import scan_friendly_convolution  # noqa: E402
 from experiments.benchmark import inputs  # noqa: E402
 
@@ -29,7 +30,7 @@ def float32_stays_float32() -> None:
     frames = jax.tree.map(lambda *leaves: np.stack(leaves), *inputs.frames(4, 32, 32))
     for name in METHODS:
         method = getattr(methods, name)()
-        variables = jax.eval_shape(method.init, jax.random.key(0), rollout.select_time(frames, 0))
+        variables = jax.eval_shape(method.init, jax.random.key(0), select_time(frames, 0))
         assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(variables)), name
         schedule = rollout.every() if method.info.renders_all else rollout.alternate()
 

@@ -16,12 +16,12 @@ LEVELS = {
     "essjax.methods": 5, "essjax.data": 5, "essjax.scenes": 5,
     "essjax.rollout": 6, "essjax.metrics": 6,
     "essjax.train": 7, "essjax.deploy": 7,
-    "essjax.generate": 8, "essjax.cli": 8, "essjax": 8,
+    "essjax.builtin": 8, "essjax.cli": 8, "essjax": 8,
     "experiments": 9,
 }  # fmt: skip
 """A module imports only lower levels, its own package aside. Modules of one level do not know each other."""
-SAME_LEVEL = {("essjax.cli", "essjax.generate")}
-"""The one exception: the command line offers what generate joins from scenes and data."""
+SAME_LEVEL = {("essjax.cli", "essjax.builtin")}
+"""The one exception: the command line offers what builtin joins from scenes and data."""
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".cff", ".yaml", ".yml", ".html", ".js", ".css", ".json", ".txt", ".cfg"}
 MAX_LINES = 400
 
@@ -95,11 +95,11 @@ def test_imports_only_lower_levels(path):
     ("module", "source", "expected"),
     [
         ("essjax.warp.backward", "from essjax.methods import taau", "essjax.methods"),
-        ("essjax.losses.pixel", "import essjax.networks.frnet", "essjax.networks"),
-        ("essjax.networks.frnet", "from essjax import losses", "essjax.losses"),
+        ("essjax.losses.pixel", "import essjax.networks._frnet", "essjax.networks"),
+        ("essjax.networks._frnet", "from essjax import losses", "essjax.losses"),
         ("essjax.scenes.render", "def f():\n    from essjax.data.exr import read", "essjax.data"),
         ("essjax.data.loader", "from ..scenes import render", "essjax.scenes"),
-        ("essjax.methods.extrass", "from flax import linen", "only essjax.networks"),
+        ("essjax.methods._extrass", "from flax import linen", "only essjax.networks"),
         ("essjax.train.step", "from experiments.variants import VARIANTS", "experiments"),
     ],
 )
@@ -110,8 +110,8 @@ def test_the_check_sees_what_is_forbidden(module, source, expected):
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("essjax.networks.frnet", "import flax.linen as nn\nfrom essjax.interfaces import Network"),
-        ("essjax.methods.extrass", "from essjax.networks import frnet\nfrom essjax.methods.baselines import jau"),
+        ("essjax.networks._frnet", "import flax.linen as nn\nfrom essjax.interfaces import Network"),
+        ("essjax.methods._extrass", "from essjax.networks import frnet\nfrom essjax.methods.baselines import jau"),
         ("essjax.warp", "from .sampling import sample"),
         ("experiments.run", "from essjax.cli import main\nfrom essjax import __version__"),
     ],

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-import essjax.generate
+import essjax.builtin
 from essjax import cli
+from essjax.builtin import Clip, generate, live_source, plan
 from essjax.data import clips, read_dataset, read_sequence
 from essjax.frames import select_time, validate_sequence
-from essjax.generate import Clip, generate, live_source, plan
 from essjax.scenes import TEST_ONLY_FAMILIES, TRAIN_FAMILIES
 from tests.data.importing.dumps import truth
 from tests.data.importing.test_blender import dump  # noqa: F401 (fixture)
@@ -35,7 +35,7 @@ def instant_renderer(monkeypatch):
         frame = select_time(jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), noise), index)
         return dataclasses.replace(frame, steady=frame.valid)
 
-    monkeypatch.setattr(essjax.generate, "render_frame", render_frame)
+    monkeypatch.setattr(essjax.builtin, "render_frame", render_frame)
     return calls
 
 
@@ -198,7 +198,7 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, instant_renderer, monkeypat
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(essjax.generate, "render_frame", interrupted)
+    monkeypatch.setattr(essjax.builtin, "render_frame", interrupted)
     code, output = run(capsys, "scenes", tmp_path / "out", "--families", "gloss", "--size", "8x6")
     assert code == 130 and "run the same command again to resume" in output
 

@@ -19,9 +19,9 @@ import pytest
 import tyro
 
 from essjax import cli
+from essjax.builtin import plan
 from essjax.data.importing import PRESETS
 from essjax.data.importing.recipe import load_recipe
-from essjax.generate import plan
 from experiments import compare, run, tables
 from experiments.benchmark import __main__ as benchmark
 from experiments.tables import __main__ as tables_command
@@ -197,24 +197,17 @@ def test_calls_of_the_readme_fit_their_functions():
     """What its Python calls exists and takes these arguments; nothing is run: it would compile for half a minute."""
     (block,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
     tree, found = ast.parse(block), []
+    imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
     scope = {}
-    exec(
-        compile(
-            ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], []), "", "exec"
-        ),
-        scope,
-    )
+    exec(compile(ast.Module(imports, []), "", "exec"), scope)
     for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Attribute)
-            and isinstance(node.func.value, ast.Name)
-        ):
-            module = scope.get(node.func.value.id)
-            if module is not None:
-                function = getattr(module, node.func.attr)
-                inspect.signature(function).bind(*node.args, **{word.arg: word.value for word in node.keywords})
-                found.append(node.func.attr)
+        if not isinstance(node, ast.Call):
+            continue
+        module, _, name = ast.unparse(node.func).rpartition(".")
+        if module.split(".")[0] in scope:
+            function = getattr(eval(module, scope), name)
+            inspect.signature(function).bind(*node.args, **{word.arg: word.value for word in node.keywords})
+            found.append(name)
     assert {"make_scene", "render_sequence", "backward_warp", "extrass", "unroll"} <= set(found)
 
 

@@ -4,10 +4,10 @@ Inputs are ``[..., H, W, C]`` with any leading axes, on whatever scale the objec
 otherwise). Gradients are finite everywhere. Reduce with ``jnp.mean``, ``masked_mean`` or ``sum_of_means``.
 """
 
-from essjax.losses.census import census, feature_census
+from essjax.losses._census import census, feature_census
+from essjax.losses._perceptual import perceptual
 from essjax.losses.classes import class_weights, cross_entropy
 from essjax.losses.holes import hardest, masked_mean, occlusion
-from essjax.losses.perceptual import perceptual
 from essjax.losses.pixel import charbonnier, l1
 from essjax.losses.ssim import ssim_map
 from essjax.losses.temporal import feature_l1, spatio_temporal, sum_of_means, temporal_l1

@@ -8,14 +8,14 @@ from essjax.color import demodulate, expm1, modulate
 from essjax.exposure import exposed
 from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require
 from essjax.interfaces import Method, MethodInfo
+from essjax.methods._composed import composed
+from essjax.methods._extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
+from essjax.methods._nsrr import nsrr
 from essjax.methods.baselines import jau_image
-from essjax.methods.composed import composed
-from essjax.methods.extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
-from essjax.methods.nsrr import nsrr
 from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_shading, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
-from essjax.networks.extranet import FRAMES, input_shapes
-from essjax.networks.extranet import extranet as extranet_network
+from essjax.networks._extranet import FRAMES, input_shapes
+from essjax.networks._extranet import extranet as extranet_network
 from essjax.typing import Color, Image
 from essjax.warp import jitter_aligned_upsample, upsample_motion, zero_upsample
 

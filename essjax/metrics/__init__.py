@@ -6,9 +6,9 @@ the single metrics take images that already are display-referred, with any leadi
 """
 
 from essjax.losses import ssim_map
-from essjax.metrics.psnr import MAX_PSNR, psnr
+from essjax.metrics._psnr import MAX_PSNR, psnr
+from essjax.metrics._ssim import ssim
 from essjax.metrics.score import METRICS, MIN_HOLE_PIXELS, PHASES, aggregate, has_source, mean_over, score_rollout
-from essjax.metrics.ssim import ssim
 from essjax.metrics.temporal import flicker, spatio_temporal_error, tpsnr, warped_error
 
 __all__ = [

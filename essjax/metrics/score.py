@@ -11,8 +11,8 @@ import numpy as np
 from essjax.color import display
 from essjax.exposure import clip_exposure
 from essjax.losses.pixel import as_float32
-from essjax.metrics.psnr import psnr
-from essjax.metrics.ssim import ssim
+from essjax.metrics._psnr import psnr
+from essjax.metrics._ssim import ssim
 from essjax.metrics.temporal import spatio_temporal_error, tpsnr, warped_error
 from essjax.typing import Array, Color, Int, Mask, Motion, Scalar
 from essjax.warp import compose_motion

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from essjax.losses import masked_mean, spatio_temporal
 from essjax.losses.pixel import as_float32, check_same_shape
-from essjax.metrics.psnr import PIXEL_AXES, psnr
+from essjax.metrics._psnr import PIXEL_AXES, psnr
 from essjax.typing import Image, Mask, Motion, Scalar
 from essjax.warp import backward_warp
 

@@ -4,10 +4,10 @@ import zlib
 
 import numpy as np
 
+from essjax.scenes._rigging import rigging
 from essjax.scenes.builder import Builder, Scene
 from essjax.scenes.indoor import carousel, corridor, gloss
 from essjax.scenes.outdoor import cuts, grille, plaza, shadows, texture
-from essjax.scenes.rigging import rigging
 
 TRAIN_FAMILIES = ("corridor", "carousel", "grille", "gloss", "shadows", "texture")
 """Families in every split: fast camera and large disocclusions; rigid and rotating objects; thin rods; mirror images in

@@ -8,7 +8,7 @@ Directions are unit length in the world; transforms keep the ray parameter, so t
 import jax
 import jax.numpy as jnp
 
-from essjax.scenes.vec import Vec, dot, larger, normalize, smaller
+from essjax.scenes._vec import Vec, dot, larger, normalize, smaller
 from essjax.scenes.world import BOX, CAPACITY, OFFSET, RECT, ROD, ROW_KIND, ROW_MEMBER, SPHERE, World, columns
 from essjax.typing import Array, Callable, Float, Int
 

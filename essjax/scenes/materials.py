@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.scenes import geometry, textures
-from essjax.scenes.vec import Vec, dot, larger, mix, normalize, saturate, select, smaller, stage
+from essjax.scenes._vec import Vec, dot, larger, mix, normalize, saturate, select, smaller, stage
 from essjax.scenes.world import ROD, World, material_columns
 from essjax.typing import Array, Float, Int, pytree
 

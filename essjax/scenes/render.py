@@ -14,10 +14,10 @@ import numpy as np
 
 from essjax import kernels
 from essjax.scenes import geometry
+from essjax.scenes._vec import Vec, dot, normalize, select, stack
 from essjax.scenes.jitter import reference_samples
 from essjax.scenes.materials import Surface, surface
 from essjax.scenes.shading import direct, environment, mirror_weight, radiance
-from essjax.scenes.vec import Vec, dot, normalize, select, stack
 from essjax.scenes.world import World
 from essjax.typing import Array, Callable, Float
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from essjax.scenes import geometry, textures
+from essjax.scenes._vec import Vec, dot, larger, mix, normalize, reflect, saturate, select, smaller, vec
 from essjax.scenes.materials import Surface, surface
-from essjax.scenes.vec import Vec, dot, larger, mix, normalize, reflect, saturate, select, smaller, vec
 from essjax.scenes.world import World
 from essjax.typing import Array
 

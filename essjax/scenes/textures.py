@@ -7,7 +7,7 @@ sine, no power, no table.
 
 import jax.numpy as jnp
 
-from essjax.scenes.vec import larger, saturate, smaller, stage
+from essjax.scenes._vec import larger, saturate, smaller, stage
 from essjax.typing import Array
 
 PLAIN, CHECKER, CELLS, GLYPHS, STRIPES, DOTS, NOISE = range(7)

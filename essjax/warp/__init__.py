@@ -4,6 +4,7 @@ Images are ``[..., H, W, C]``, motion is ``[..., H, W, 2]`` in pixels (x right, 
 centres lie at +0.5. All functions may be jitted, vmapped and differentiated.
 """
 
+from essjax.warp._splat import splat, splat_nearest
 from essjax.warp.backward import backward_warp
 from essjax.warp.fetches import sample_by_fetches
 from essjax.warp.fill import fill_holes
@@ -12,7 +13,6 @@ from essjax.warp.motion import compose_motion, dilate_motion, jittered_motion, s
 from essjax.warp.occlusion import hole_mask, occlusion_motion
 from essjax.warp.resample import Resampled, gaussian_resample, tent_resample
 from essjax.warp.sampling import inside_mask, sample
-from essjax.warp.splat import splat, splat_nearest
 from essjax.warp.upsample import (
     depth_to_space,
     jitter_aligned_upsample,

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from essjax.cameras import pixel_positions
 from essjax.typing import Array, Image, Jitter, Mask, Motion, Plane
 from essjax.warp._batch import check_channels
+from essjax.warp._splat import splat_nearest
 from essjax.warp.sampling import inside_mask, sample
-from essjax.warp.splat import splat_nearest
 from essjax.warp.upsample import check_jitter, jitter_aligned_upsample
 
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax.builtin import plan
 from essjax.frames import frame_images, select_time, without_color
-from essjax.generate import plan
 from essjax.rollout import SS, alternate, every, stream_step, unroll
 from essjax.train import create_state, make_train_step, optimizer
 from experiments import datasets

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
+from essjax.builtin import generate, plan
 from essjax.data import Rounds
-from essjax.generate import generate, plan
 from experiments import datasets
 from experiments.ahead import batch_shapes
 from experiments.config import make_config

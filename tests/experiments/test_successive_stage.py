@@ -6,7 +6,7 @@ import itertools
 import jax
 import numpy as np
 
-from essjax.generate import generate, plan
+from essjax.builtin import generate, plan
 from essjax.train import Checkpoints
 from experiments.training import first_batch, initial_state, initial_variables, make_batches, restore_stages
 from experiments.variants import config_of, stages_of

@@ -11,7 +11,7 @@ import pytest
 from essjax.color import display, reinhard, rgb_to_ycocg, ycocg_to_rgb
 from essjax.frames import GBuffers, select_time, without_color
 from essjax.methods import classifier, jau
-from essjax.methods.classifier import (
+from essjax.methods._classifier import (
     RANGE_RATE,
     classifier_inputs,
     closeness,

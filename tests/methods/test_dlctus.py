@@ -13,7 +13,7 @@ from essjax import methods
 from essjax.color import reinhard
 from essjax.frames import select_time, without_color
 from essjax.methods import dlctus
-from essjax.methods.dlctus import REPROJECTIONS, map_color, returning_clip
+from essjax.methods._dlctus import REPROJECTIONS, map_color, returning_clip
 from essjax.networks import dlctus_network
 from essjax.rollout import SS, alternate, every, stream_step, unroll
 from essjax.warp import backward_warp, jitter_aligned_upsample, zero_upsample

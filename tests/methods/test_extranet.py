@@ -13,7 +13,7 @@ from essjax.data.importing.images import buffer
 from essjax.data.importing.recipe import load_recipe
 from essjax.frames import select_time, without_color
 from essjax.methods import extranet, extranet_from_torch
-from essjax.methods.extranet import relative_depth
+from essjax.methods._extranet import relative_depth
 from essjax.methods.rendered import albedo
 from essjax.rollout import ESS, SS, alternate, check_supported, frames_of, unroll
 from essjax.warp import backward_warp, compose_motion, hole_mask, jittered_motion, occlusion_motion

@@ -11,7 +11,7 @@ import pytest
 from essjax.color import demodulate, display, log1p, modulate, reinhard, reinhard_inverse
 from essjax.frames import GBuffers, select_time, without_color
 from essjax.methods import extrass, extrass_e, extrass_w
-from essjax.methods.extrass import history_motion, trusted, warp_shown
+from essjax.methods._extrass import history_motion, trusted, warp_shown
 from essjax.methods.extrass_low import blend_mask, refine
 from essjax.methods.rendered import albedo, hole_buffers
 from essjax.networks import frnet

@@ -12,9 +12,9 @@ from essjax import scenes
 from essjax.color import log1p
 from essjax.frames import GBuffers, select_time
 from essjax.methods import fasset, gaussian_blur
-from essjax.methods.fasset import sample_nearness
+from essjax.methods._fasset import sample_nearness
 from essjax.methods.rendered import albedo
-from essjax.networks.fasset import OUTPUT_GAIN
+from essjax.networks._fasset import OUTPUT_GAIN
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
 from essjax.scenes.render import render_reference
 from essjax.warp import hole_mask, jitter_aligned_upsample

@@ -24,7 +24,7 @@ def _apply(variables, images, prior, train=False):
 
 
 def test_it_gives_the_network_both_frames_and_the_differences_of_jitter(monkeypatch):
-    monkeypatch.setattr(sys.modules["essjax.methods.ifrnet"], "ifrnet_network", lambda width: Network(None, _apply))
+    monkeypatch.setattr(sys.modules["essjax.methods._ifrnet"], "ifrnet_network", lambda width: Network(None, _apply))
     frames = make_frames(0, T=3, B=B, H=H, W=W)
     frames = dataclasses.replace(
         frames, color=frames.color + 20.0, jitter=random_image(2, 3, B, 2, low=-0.5, high=0.5)

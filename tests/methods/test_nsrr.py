@@ -12,7 +12,7 @@ import pytest
 from essjax.color import display
 from essjax.frames import select_time
 from essjax.methods import jau, nsrr
-from essjax.methods.nsrr import warp_previous
+from essjax.methods._nsrr import warp_previous
 from essjax.methods.rendered import advance
 from essjax.rollout import SS, alternate, every, stream_step, unroll
 from tests.helpers import make_frames, random_image

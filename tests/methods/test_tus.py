@@ -10,7 +10,7 @@ import pytest
 from essjax import methods
 from essjax.color import reinhard, rgb_to_ycocg
 from essjax.frames import Frame, GBuffers
-from essjax.methods.taau import UPSAMPLED_WEIGHT, clip_to_box
+from essjax.methods._taau import UPSAMPLED_WEIGHT, clip_to_box
 from essjax.rollout import every, unroll
 from essjax.scenes.jitter import jitter_sequence
 from essjax.warp import gaussian_resample, jitter_aligned_upsample

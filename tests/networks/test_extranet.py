@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from essjax.networks import extranet
-from essjax.networks.extranet import ExtraNet, from_torch, input_shapes, torch_entries
+from essjax.networks._extranet import ExtraNet, from_torch, input_shapes, torch_entries
 from tests.helpers import random_image
 
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference" / "extranet_state_dict.json"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from essjax.networks import fasset
-from essjax.networks.fasset import LOCAL, MAX_WEIGHT, OUTPUT_GAIN, PAST, RenderINR, Reweighting
+from essjax.networks._fasset import LOCAL, MAX_WEIGHT, OUTPUT_GAIN, PAST, RenderINR, Reweighting
 from tests.helpers import random_image
 
 

@@ -11,8 +11,8 @@ import pytest
 from essjax.frames import select_time
 from essjax.methods import extrass
 from essjax.networks import extrassnet, frnet
+from essjax.networks._frnet import OFFSETS, _halfway, _read, matched_flow
 from essjax.networks.blocks import crop, pad_to_multiple
-from essjax.networks.frnet import OFFSETS, _halfway, _read, matched_flow
 from essjax.warp import backward_warp
 from tests.helpers import make_frames, random_image
 

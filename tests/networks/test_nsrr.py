@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from essjax.networks import nsrr
-from essjax.networks.nsrr import FEATURES, PREVIOUS, RGBD
+from essjax.networks._nsrr import FEATURES, PREVIOUS, RGBD
 from tests.helpers import random_image
 
 LAYERS = [

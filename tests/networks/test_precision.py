@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from essjax.networks import compute_dtype, extranet, fasset
+from essjax.networks._extranet import input_shapes
+from essjax.networks._fasset import LOCAL, PAST
 from essjax.networks.blocks import conv
-from essjax.networks.extranet import input_shapes
-from essjax.networks.fasset import LOCAL, PAST
 
 
 def _random(shapes, seed=0):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from essjax.scenes import geometry, textures
+from essjax.scenes._vec import Vec
 from essjax.scenes.builder import FLOOR, Builder, between, look_at, rotation
 from essjax.scenes.materials import Material
-from essjax.scenes.vec import Vec
 from essjax.scenes.world import BOX, OFFSET, ROD, ROW_KIND, SPHERE
 
 trace = jax.jit(geometry.trace)

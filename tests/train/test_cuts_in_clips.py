@@ -11,7 +11,7 @@ from essjax.exposure import exposed
 from essjax.frames import Prediction
 from essjax.interfaces import Network
 from essjax.losses import spatio_temporal
-from essjax.methods.extrass import Warped
+from essjax.methods._extrass import Warped
 from essjax.train import (
     dlctus_objective,
     extranet_objective,

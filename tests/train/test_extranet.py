@@ -12,7 +12,7 @@ from essjax.exposure import exposed
 from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods import extranet
-from essjax.methods.extranet import Inputs
+from essjax.methods._extranet import Inputs
 from essjax.methods.rendered import albedo
 from essjax.train import extranet_objective, predict_last
 from tests.helpers import make_sequence, random_image

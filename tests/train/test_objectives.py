@@ -11,7 +11,7 @@ from essjax.exposure import exposed
 from essjax.frames import Prediction, select_time
 from essjax.interfaces import Method, MethodInfo, Network, reset_at_cut
 from essjax.losses import census, feature_census
-from essjax.methods.extrass import Warped
+from essjax.methods._extrass import Warped
 from essjax.rollout import ESS, SS
 from essjax.train import Recurrent, both_kinds, extrass_objective, frnet_objective
 from essjax.train.objectives.common import follow_both_kinds, since_cut, start_both_kinds

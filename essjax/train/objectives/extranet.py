@@ -8,7 +8,7 @@ from essjax.color import demodulate, expose, log1p
 from essjax.frames import Sequence, rendered_color, select_time
 from essjax.interfaces import Method
 from essjax.losses import hardest, l1, masked_mean, occlusion
-from essjax.methods.extranet import WINDOW
+from essjax.methods._extranet import WINDOW
 from essjax.methods.fasset_baselines import enlarge
 from essjax.methods.rendered import albedo
 from essjax.train.objectives.common import Objective, predict_last, since_cut

@@ -6,7 +6,7 @@ from essjax.color import display, expose
 from essjax.frames import Sequence, select_time
 from essjax.interfaces import Method
 from essjax.losses import perceptual, ssim_map, sum_of_means
-from essjax.networks.nsrr import PREVIOUS
+from essjax.networks._nsrr import PREVIOUS
 from essjax.rollout import alternate, every
 from essjax.train.objectives.common import Objective, predict_last
 from essjax.typing import Array, Callable, PyTree

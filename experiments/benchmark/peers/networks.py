@@ -8,9 +8,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from essjax.networks.fasset import MAX_WEIGHT, OUTPUT_GAIN
-from essjax.networks.frnet import COST_OF_ROUGHNESS, COST_PER_PIXEL, OFFSETS, PATCH, SMOOTH, TEMPERATURE
-from essjax.networks.nsrr import PREVIOUS, RGBD
+from essjax.networks._fasset import MAX_WEIGHT, OUTPUT_GAIN
+from essjax.networks._frnet import COST_OF_ROUGHNESS, COST_PER_PIXEL, OFFSETS, PATCH, SMOOTH, TEMPERATURE
+from essjax.networks._nsrr import PREVIOUS, RGBD
 from experiments.benchmark.peers import Peer
 from experiments.benchmark.peers.layers import (
     Weights,
@@ -29,7 +29,7 @@ from experiments.benchmark.peers.warps import backward_warp, nchw
 
 
 def decode(features: list, p: Weights):
-    """``networks.extrassnet.Decoder``: features finest first."""
+    """``networks._extrassnet.Decoder``: features finest first."""
     x = features[-1]
     for n, skip in enumerate(features[-2::-1]):
         wide = F.interpolate(conv(x, p[f"Conv_{n}"]), scale_factor=2, mode="nearest")
@@ -111,7 +111,7 @@ def _shifted(x, right: float, down: float):
 
 
 def _matched_flow(warped, roughness):
-    """``networks.frnet.matched_flow``."""
+    """``networks._frnet.matched_flow``."""
     price = COST_PER_PIXEL * (1.0 + COST_OF_ROUGHNESS * (roughness - SMOOTH).clamp(min=0.0))
     costs = []
     for x, y in _OFFSETS:

@@ -11,9 +11,9 @@ from essjax import networks
 from essjax.deploy import count_parameters
 from essjax.interfaces import Network
 from essjax.networks import compute_dtype
-from essjax.networks.extranet import input_shapes
-from essjax.networks.fasset import LOCAL, PAST
-from essjax.networks.nsrr import FEATURES, PREVIOUS
+from essjax.networks._extranet import input_shapes
+from essjax.networks._fasset import LOCAL, PAST
+from essjax.networks._nsrr import FEATURES, PREVIOUS
 from experiments.benchmark import inputs, peers
 from experiments.benchmark.measure import Case, measure
 from experiments.benchmark.suites import Options, Row

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax.builtin import generate, plan
 from essjax.frames import Frame, Sequence
-from essjax.generate import generate, plan
 from essjax.interfaces import Method
 from essjax.rollout import alternate, unroll
 from essjax.train import create_state, make_train_step, optimizer

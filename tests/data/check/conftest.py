@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
+from essjax.builtin import Clip, generate
 from essjax.data import import_dataset
-from essjax.generate import Clip, generate
 from tests.data.check.corrupt import CHESS, SIZE
 
 

@@ -18,8 +18,8 @@ from essjax.frames import Frame, GBuffers, Prediction, background, rendered_colo
 from essjax.interfaces import Method, MethodInfo, expand_flag
 from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_shading, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
-from essjax.networks.extranet import FRAMES, input_shapes
-from essjax.networks.extranet import from_torch as network_from_torch
+from essjax.networks._extranet import FRAMES, input_shapes
+from essjax.networks._extranet import from_torch as network_from_torch
 from essjax.tensors import read_tensors
 from essjax.typing import Array, Color, Image, Mask, Motion, Plane, PyTree, pytree
 from essjax.warp import backward_warp, hole_mask, jittered_motion, occlusion_motion

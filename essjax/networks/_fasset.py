@@ -10,8 +10,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from essjax.interfaces import Network
+from essjax.networks._extrassnet import Decoder
 from essjax.networks.blocks import Chain, GatedConv, conv, crop, mean_pool, pad_to_multiple, zero_conv
-from essjax.networks.extrassnet import Decoder
 from essjax.networks.linen import from_linen, kernel_bound
 from essjax.networks.precision import dot_general
 from essjax.typing import Array, Color, Image, Jitter, Mask

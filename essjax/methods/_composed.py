@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from essjax.exposure import metered
 from essjax.frames import Frame, Prediction, without_color
 from essjax.interfaces import Method, MethodInfo, Step, no_variables
+from essjax.methods._taau import taa
 from essjax.methods.shots import continued
-from essjax.methods.taau import taa
 from essjax.typing import Callable, Color
 
 

@@ -38,7 +38,7 @@ from essjax.methods.rendered import (
     start_memory,
 )
 from essjax.methods.shots import within_shots
-from essjax.networks.fasset import LOCAL, PAST
+from essjax.networks._fasset import LOCAL, PAST
 from essjax.typing import Array, Callable, Color, Image, Jitter, Mask, Scalar, pytree
 from essjax.warp import (
     backward_warp,

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from essjax.losses import masked_mean, ssim_map
-from essjax.metrics.psnr import PIXEL_AXES
+from essjax.metrics._psnr import PIXEL_AXES
 from essjax.typing import Image, Mask, Scalar
 
 

@@ -17,8 +17,8 @@ from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at
 from essjax.methods.baselines import jau_image
 from essjax.methods.rendered import Memory, advance, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
-from essjax.networks.nsrr import FEATURES, PREVIOUS, RGBD
-from essjax.networks.nsrr import nsrr as nsrr_network
+from essjax.networks._nsrr import FEATURES, PREVIOUS, RGBD
+from essjax.networks._nsrr import nsrr as nsrr_network
 from essjax.typing import Array, Image, pytree
 from essjax.warp import jitter_aligned_upsample, sample_zero_upsampled, upsample_motion, zero_upsample
 

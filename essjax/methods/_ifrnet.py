@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from essjax.color import expm1, log1p
 from essjax.interfaces import Method
 from essjax.methods.interpolation import interpolator
-from essjax.networks.ifrnet import ifrnet as ifrnet_network
+from essjax.networks._ifrnet import ifrnet as ifrnet_network
 
 
 def ifrnet(*, width: int = 24) -> Method:

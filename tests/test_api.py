@@ -1,0 +1,84 @@
+"""The public surface: lazy, named once, nothing that is there by accident."""
+
+import ast
+import pkgutil
+import subprocess
+import sys
+
+import essjax
+from tests.test_architecture import ROOT, module_name, sources
+
+
+def test_import_essjax_leaves_jax_out_and_modules_come_when_named():
+    program = (
+        "import sys, essjax; assert not {'jax', 'numpy', 'flax'} & set(sys.modules);"
+        "assert callable(essjax.methods.extrass); assert 'jax' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_dir_and_wrong_names():
+    assert set(essjax.__all__) < set(dir(essjax))
+    try:
+        essjax.method  # noqa: B018
+    except AttributeError as error:
+        assert str(error) == "module 'essjax' has no attribute 'method'"
+
+
+def test_every_module_is_offered():
+    found = {module.name for module in pkgutil.iter_modules(essjax.__path__) if not module.name.startswith("_")}
+    assert found - {"cli"} == set(essjax.__all__)
+
+
+def defined(tree: ast.Module) -> set[str]:
+    """Names that a module defines itself, and what it lists in ``__all__``."""
+    names = {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found = {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
+            names |= found | (set(ast.literal_eval(node.value)) if "__all__" in found else set())
+    return names
+
+
+TREES = {
+    module_name(path): ast.parse(path.read_text()) for path in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]
+}
+NAMES = {module: defined(tree) for module, tree in TREES.items()}
+
+
+def accidents(tree: ast.Module) -> list[str]:
+    """What a module takes from another that only imported it: ``rollout.select_time``."""
+    found, modules = [], {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module in NAMES:
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                if name in NAMES:
+                    modules[alias.asname or alias.name] = name
+                elif alias.name not in NAMES[node.module]:
+                    found.append(name)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            name = f"{modules[node.value.id]}.{node.attr}"
+            if name not in NAMES and node.attr not in NAMES[modules[node.value.id]]:
+                found.append(name)
+    return found
+
+
+def test_names_are_taken_from_where_they_are_made():
+    ours = {module: accidents(tree) for module, tree in TREES.items() if not module.startswith("tests.")}
+    assert not {module: names for module, names in ours.items() if names}
+    assert accidents(ast.parse("from essjax import rollout\nrollout.select_time")) == ["essjax.rollout.select_time"]
+    assert accidents(ast.parse("from essjax.rollout import select_time")) == ["essjax.rollout.select_time"]
+
+
+def test_no_module_has_the_name_of_what_it_holds():
+    """``essjax.warp.splat`` would be the function or the module, by the order of imports."""
+    offenders = [
+        module
+        for module, tree in TREES.items()
+        for node in tree.body
+        if module.startswith("essjax.") and getattr(node, "name", "") == module.rpartition(".")[2]
+    ]
+    assert not offenders, "put an underscore in front of the module's name"
