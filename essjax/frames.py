@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax.buffers import BUFFERS, OPTIONAL_GBUFFERS, RANGES
 from essjax.cameras import Camera
 from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree, Scalar, Vectors, pytree
 
@@ -141,32 +142,6 @@ class Prediction:
     state: dict[str, PyTree] = dataclasses.field(default_factory=dict)
 
 
-OPTIONAL_GBUFFERS = (
-    "base_color", "normal", "roughness", "metallic", "specular", "world_position", "stencil", "n_dot_v",
-)  # fmt: skip
-PURPOSES = {
-    "base_color": "divides the texture out of the shading and guides the warp",
-    "normal": "tells surfaces apart: guides the warp",
-    "roughness": "tells mirrors from matt surfaces",
-    "metallic": "belongs to the divisor of the shading",
-    "specular": "belongs to the divisor of the shading",
-    "world_position": "finds holes on static surfaces",
-    "stencil": "tells moving objects apart",
-    "n_dot_v": "finds holes at grazing angles",
-}
-"""What a method wants a buffer for: the reason that ``require`` gives."""
-CHANNELS = {
-    "color": 3, "base_color": 3, "normal": 3, "depth": 1, "roughness": 1, "metallic": 1, "specular": 1,
-    "world_position": 3, "stencil": 1, "n_dot_v": 1, "motion": 2, "reactive": 1,
-}  # fmt: skip
-"""Number of channels of every image a frame may hold."""
-RANGE_CHANNELS = {
-    "depth_min": 1, "depth_max": 1, "color_min": 3, "color_max": 3, "normal_spread": 1, "normal_spread_smooth": 1,
-    "motion": 2,
-}  # fmt: skip
-"""Number of channels of every image of ``SampleRanges``."""
-
-
 def frame_images(frame: Frame) -> dict[str, jax.Array | np.ndarray]:
     """The images that a frame holds, by name; absent ones are left out."""
     images = {"color": frame.color, "motion": frame.motion, "reactive": frame.reactive}
@@ -203,7 +178,8 @@ def require(frame: Frame, names: Iterable[str], method: str) -> None:
     present = frame_images(frame)
     missing = [name for name in names if name not in present]
     if missing:
-        why = "".join(f" {name} {PURPOSES[name]}." for name in missing if name in PURPOSES)
+        purposes = {name: BUFFERS[name].purpose for name in missing if name in BUFFERS}
+        why = "".join(f" {name} {purpose}." for name, purpose in purposes.items() if purpose)
         raise ValueError(
             f"{method} needs the buffers {', '.join(missing)}, which these frames do not have "
             f"(they have {', '.join(present)}).{why} Render or import them, or choose another method."
@@ -217,10 +193,10 @@ def check_shapes(frame: Frame, where: str = "frame") -> None:
     """
     *leading, height, width = frame.motion.shape[:-1]
     for name, image in frame_images(frame).items():
-        expected = (height, width, CHANNELS[name])
+        expected = (height, width, BUFFERS[name].channels)
         if image.shape[-3:] != expected:
             raise ValueError(
-                f"{where}, channel {name}: expected [..., {height}, {width}, {CHANNELS[name]}] (the size of motion), "
+                f"{where}, channel {name}: expected [..., {height}, {width}, {expected[-1]}] (the size of motion), "
                 f"got {tuple(image.shape)}. Resample it, or pass the matching channels."
             )
     if frame.jitter.shape[-1:] != (2,):
@@ -300,7 +276,7 @@ def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] =
             length = np.sqrt(np.einsum("...c,...c->...", values, values))
             long = length > 1 + _NORMAL_TOLERANCE  # a mean over samples is shorter
             _reject(long, length, where, name, "unit length", "Decode or normalise it at import.")
-        elif name in ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive"):
+        elif BUFFERS[name].unit_range:
             outside = (values < 0) | (values > 1 + 1e-3)
             _reject(outside, values, where, name, "values in [0, 1]", "Rescale or clamp it at import.")
     jitter = np.asarray(frame.jitter)
@@ -346,9 +322,9 @@ def validate_ranges(ranges: SampleRanges, height: int, width: int, where: str = 
 
     Checks sizes, finite values (depth may be +inf: background) and that no minimum is above its maximum.
     """
-    images = {name: np.asarray(getattr(ranges, name)) for name in RANGE_CHANNELS}
+    images = {name: np.asarray(getattr(ranges, name)) for name in RANGES}
     for name, image in images.items():
-        expected = (height, width, RANGE_CHANNELS[name])
+        expected = (height, width, len(RANGES[name]))
         if image.shape[-3:] != expected:
             raise ValueError(
                 f"{where}, {name}: expected [..., {height}, {width}, {expected[-1]}] (the reference's size), "

@@ -7,11 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from essjax.buffers import BUFFERS, RANGES
 from essjax.cameras import Camera
-from essjax.frames import RANGE_CHANNELS, Frame, SampleRanges, Sequence, frame_images, gbuffers_of
+from essjax.frames import Frame, SampleRanges, Sequence, frame_images, gbuffers_of
 
 _AXES = {"horizontal": 0, "vertical": 1}
-_MIRRORED = {"motion": 2, "normal": 3, "world_position": 3}
+_MIRRORED = {name: buffer.channels for name, buffer in BUFFERS.items() if buffer.directed}
 """Images whose component along the flipped axis changes sign, with their number of components."""
 
 
@@ -142,7 +143,7 @@ def _flip_frame(frame: Frame, component: int) -> Frame:
 
 
 def _flip_ranges(ranges: SampleRanges, component: int) -> SampleRanges:
-    images = {name: np.asarray(getattr(ranges, name)) for name in RANGE_CHANNELS}
+    images = {name: np.asarray(getattr(ranges, name)) for name in RANGES}
     return SampleRanges(**{name: _mirror(name, image, component) for name, image in images.items()})
 
 

@@ -17,10 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import OpenEXR
 
-FULL_PRECISION = frozenset({"depth", "depth_min", "depth_max", "world_position", "motion"})
-"""Layers kept in float32: half resolves 64 px of motion to 1/16 px and 1 km of depth to 0.5 m."""
-DEPTHS = frozenset({"depth", "depth_min", "depth_max"})
-"""Layers that may be +inf: background."""
+from essjax.buffers import DEPTHS, FULL_PRECISION
+
 HALF_MAX = 65504.0
 SMALL_IMAGE = 512 << 20
 """A file may always declare this many bytes of pixels ..."""

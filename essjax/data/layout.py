@@ -20,21 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from essjax.buffers import BUFFERS, MASKS, RANGES
 from essjax.cameras import Camera
 from essjax.data import exr
 
 SCHEMA = 1
-SUFFIXES = {
-    "color": "RGB", "base_color": "RGB", "normal": "XYZ", "depth": "Z", "roughness": "Y", "metallic": "Y",
-    "specular": "Y", "world_position": "XYZ", "stencil": "Y", "n_dot_v": "Y", "motion": "XY", "reactive": "Y",
-    "valid": "Y", "steady": "Y",
-}  # fmt: skip
+SUFFIXES = {**{name: buffer.suffixes for name, buffer in BUFFERS.items()}, **dict.fromkeys(MASKS, "Y")}
 """Channel suffixes of every image of an ``lr`` or ``native`` file."""
-RANGE_SUFFIXES = {
-    "depth_min": "Z", "depth_max": "Z", "color_min": "RGB", "color_max": "RGB", "normal_spread": "Y",
-    "normal_spread_smooth": "Y", "motion": "XY",
-}  # fmt: skip
-"""The same of a ``ranges`` file."""
 KINDS = ("lr", "hr", "native", "ranges")
 """Kinds of files that a frame may consist of."""
 
@@ -141,7 +133,7 @@ class Dataset:
 
 def channel_names(image: str) -> list[str]:
     """``["normal.X", "normal.Y", "normal.Z"]`` of ``"normal"``."""
-    return [f"{image}.{suffix}" for suffix in {**RANGE_SUFFIXES, **SUFFIXES}[image]]
+    return [f"{image}.{suffix}" for suffix in {**RANGES, **SUFFIXES}[image]]
 
 
 def frame_path(root: Path, name: str, kind: str, number: int) -> Path:

@@ -8,13 +8,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from essjax.buffers import MASKS, RANGES
 from essjax.cameras import Camera
 from essjax.data import exr
 from essjax.data.augment import start_with_cut
 from essjax.data.layout import Dataset, Segment, SequenceInfo, channel_names, frame_path, stack_planes, whole
-from essjax.frames import RANGE_CHANNELS, Frame, SampleRanges, Sequence, gbuffers_of
-
-MASKS = ("valid", "steady")
+from essjax.frames import Frame, SampleRanges, Sequence, gbuffers_of
 
 
 def _sized(path: Path, channels: dict[str, np.ndarray], width: int, height: int) -> dict[str, np.ndarray]:
@@ -83,7 +82,7 @@ def read_frame(root: Path, info: SequenceInfo, record: Mapping, *, native: bool,
         sample_ranges = None
         if ranges:
             path = frame_path(root, info.name, "ranges", number)
-            sample_ranges = SampleRanges(**_read_images(path, RANGE_CHANNELS, wide, high))
+            sample_ranges = SampleRanges(**_read_images(path, RANGES, wide, high))
         return Sequence(
             frames=_make_frame(images, record),
             reference=np.stack([reference[name] for name in "RGB"], axis=-1).astype(np.float32),

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import OpenEXR
 
+from essjax.buffers import RANGES
 from essjax.data import exr
 from essjax.data.layout import (
     AGREE,
@@ -23,7 +24,6 @@ from essjax.data.layout import (
 )
 from essjax.data.records import differences, digest, frame_record, plain, planes_of
 from essjax.frames import (
-    RANGE_CHANNELS,
     Frame,
     SampleRanges,
     Sequence,
@@ -339,7 +339,7 @@ class SequenceWriter:
         if extra.native is not None:
             files["native"] = planes_of(frame_images(extra.native))
         if extra.ranges is not None:
-            files["ranges"] = planes_of({name: getattr(extra.ranges, name) for name in RANGE_CHANNELS})
+            files["ranges"] = planes_of({name: getattr(extra.ranges, name) for name in RANGES})
         clamped = sum(
             exr.write(self._path(kind, number), planes, attributes=attributes) for kind, planes in files.items()
         )

@@ -6,8 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
+from essjax.buffers import RANGES
 from essjax.cameras import Camera
-from essjax.frames import RANGE_CHANNELS, Frame, SampleRanges, Sequence, gbuffers_of
+from essjax.frames import Frame, SampleRanges, Sequence, gbuffers_of
 from essjax.scenes.builder import Scene
 from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
@@ -99,7 +100,7 @@ def render_frame(
 
 def _ranges(images: dict[str, np.ndarray], unit: float) -> SampleRanges:
     scales = {name: np.float32(unit) for name in ("color_min", "color_max")}
-    return SampleRanges(**{name: images[name] * scales.get(name, np.float32(1)) for name in RANGE_CHANNELS})
+    return SampleRanges(**{name: images[name] * scales.get(name, np.float32(1)) for name in RANGES})
 
 
 def iterate_frames(

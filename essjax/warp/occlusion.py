@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from essjax.buffers import BUFFERS
 from essjax.cameras import pixel_positions
 from essjax.color import sum_channels
 from essjax.frames import GBuffers
@@ -14,7 +15,7 @@ from essjax.warp.sampling import axis_taps, fetch, inside_mask, sample
 _MIN_N_DOT_V = 0.1
 _TYPICAL_N_DOT_V = 0.25  # where the channel is absent: towards grazing, so that floors are not holes
 _OFF_SCREEN = 1e9  # pixels: a splat drops what goes there
-_COMPARED = {"depth": 1, "normal": 3, "world_position": 3, "stencil": 1, "n_dot_v": 1}  # buffer: channels
+_COMPARED = ("depth", "normal", "world_position", "stencil", "n_dot_v")
 _MIN_TAP_WEIGHT = 0.1  # a tap that bilinear interpolation hardly reads proves little
 
 
@@ -121,11 +122,11 @@ def hole_mask(
     """
     check_channels("motion", motion, 2)
     height, width = motion.shape[-3:-1]
-    for name, channels in _COMPARED.items():
+    for name in _COMPARED:
         for which, gbuffers in (("current", current), ("previous", previous)):
             image = getattr(gbuffers, name)
             if image is not None:
-                check_channels(f"{which}.{name}", image, channels, (height, width))
+                check_channels(f"{which}.{name}", image, BUFFERS[name].channels, (height, width))
     if (jitter is None) != (jitter_previous is None):
         raise ValueError("hole_mask: expected both jitter and jitter_previous or neither, got one.")
     lookup = motion if jitter is None or jitter_previous is None else jittered_motion(motion, jitter, jitter_previous)

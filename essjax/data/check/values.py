@@ -5,16 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from essjax.buffers import BUFFERS, UNIT_RANGE
 from essjax.data.check.finding import Finding, some
 from essjax.data.check.pairs import Step
 from essjax.data.exr import HALF_MAX
 from essjax.data.layout import SUFFIXES
 
-UNIT_RANGE = ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive")
 TOLERANCE = 1e-3
 """By which a value may leave its range: half precision."""
-VARIES = ("color", "reference", "base_color", "normal", "depth", "world_position", "motion")
-"""Images of which every channel is expected to change; one roughness for a whole scene is nothing odd."""
+VARIES = ("reference", *(name for name, buffer in BUFFERS.items() if buffer.varies))
 CLIPPED = {1.0: 1e-4, 255.0: 1e-4, HALF_MAX: 1e-2}
 """Largest values that display-referred pictures and half-precision files have -> share of values that is too much: a
 few at the end of half are a sun or a lamp."""

@@ -66,10 +66,27 @@ class RecipeClip:
         root = self.reference_root if image == "reference" and self.reference_root else self.root
         return root / fill(self.recipe.pattern(image), self.sequence, self.digits[number])
 
+    def files(self, number: int) -> list[Path]:
+        """What one frame is read from, there or not."""
+        images = (*self.images, *(("reference",) if self.reference_root else ()))
+        return list(dict.fromkeys(self.path(image, number) for image in images))
+
+    def said(self, number: int) -> str:
+        """The facts of a frame and of the one before, as far as they are not in its files."""
+        if "metadata" not in self.recipe.files:
+            return ""
+        said = []
+        for n in (number - 1, number):
+            if n in self.digits:
+                try:
+                    said.append(dataclasses.asdict(self.facts(n, {})))
+                except ValueError as error:  # the metadata lacks the frame: converting it says so
+                    said.append({"missing": str(error)})
+        return repr(said)
+
     def missing(self) -> list[Path]:
         """Files of the clip that are not there."""
-        images = (*self.images, *(("reference",) if self.reference_root else ()))
-        paths = dict.fromkeys(self.path(image, number) for number in self.numbers for image in images)
+        paths = dict.fromkeys(path for number in self.numbers for path in self.files(number))
         return [path for path in paths if not path.is_file()]
 
     def convert(self, number: int) -> Converted:

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from essjax.buffers import UNIT_RANGE
 from essjax.data import exr
 from essjax.data.importing import convert
 from essjax.data.importing.facts import FrameFacts
 from essjax.data.importing.recipe import Recipe
 
-UNIT_RANGE = ("base_color", "roughness", "metallic", "specular", "n_dot_v", "reactive")
 LARGEST_ID = 2**31 - 1
 """Ids are int32."""
 TOLERANCE, BEYOND = 1e-3, 0.05

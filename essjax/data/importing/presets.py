@@ -1,21 +1,19 @@
 """The presets by name, and the import itself: open the dump, write its clips, then ``dataset.json``."""
 
 import dataclasses
-import functools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from essjax.data.importing.arm import arm_facts
-from essjax.data.importing.blender import BlenderClip, open_blender
-from essjax.data.importing.dump import MakeFacts, RecipeClip, open_dump
+from essjax.data.importing.blender import open_blender
+from essjax.data.importing.dump import MakeFacts, open_dump
 from essjax.data.importing.facts import Facts, generic_facts, no_facts
 from essjax.data.importing.files import fill
-from essjax.data.importing.inputs import files_of, made_from
 from essjax.data.importing.recipe import Recipe, load_recipe
 from essjax.data.importing.splits import Range, fit_segments, split_segments
-from essjax.data.importing.stream import OnFrame, Written, open_clip, write_clip
+from essjax.data.importing.stream import Clip, OnFrame, OpenClip, Written, open_clip, write_clip
 from essjax.data.importing.unreal import header_facts
 from essjax.data.layout import (
     Dataset,
@@ -25,10 +23,6 @@ from essjax.data.layout import (
     read_sequence_info,
     write_dataset,
 )
-from essjax.data.store import SequenceWriter
-
-PRESETS = ("blender", "unreal", "extranet", "arm-nss", "generic")
-Clip = BlenderClip | RecipeClip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,28 +55,49 @@ class ImportReport:
         return tuple(self.sequence.source.get("dynamic", ()))
 
 
-def _facts(source: Path, preset: str) -> MakeFacts:
-    def make(sequence: str, recipe: Recipe, width: int, height: int) -> Facts:
-        if "metadata" in recipe.files:
-            path = source / fill(recipe.files["metadata"], sequence)
-            return (arm_facts if preset == "arm-nss" else generic_facts)(path, width, height)
-        if preset == "unreal":
-            return lambda number, header: header_facts(header, width, height)
-        return no_facts
+class Dump(NamedTuple):
+    """What is to be opened.
 
-    return make
+    Attributes:
+      source: the dump's folder.
+      recipe: a TOML that changes keys of the preset's, or None.
+      reference: folder of the references, or None.
+      skip_broken: whether broken and missing frames are left out.
+      workers: threads; None: one per core.
+    """
+
+    source: Path
+    recipe: Path | None
+    reference: Path | None
+    skip_broken: bool
+    workers: int | None
 
 
-def _open(
-    source: Path, preset: str, recipe: Path | None, reference: Path | None, workers: int | None, skip_broken: bool
-) -> Sequence[Clip]:
-    if preset == "blender":
-        if recipe is not None or reference is not None:
-            raise ValueError("the preset blender takes neither a recipe nor a reference folder: meta.json says it all.")
-        return [open_blender(source, workers=workers, skip_broken=skip_broken)]
-    clips = open_dump(source, load_recipe(preset, recipe), reference, _facts(source, preset), preset)
+Preset = Callable[[Dump], Sequence[Clip]]
+"""Opens a dump; a ValueError names the file and what is missing or wrong."""
+
+
+def _blender(dump: Dump) -> Sequence[Clip]:
+    if dump.recipe is not None or dump.reference is not None:
+        raise ValueError("the preset blender takes neither a recipe nor a reference folder: meta.json says it all.")
+    return [open_blender(dump.source, workers=dump.workers, skip_broken=dump.skip_broken)]
+
+
+def _by_recipe(name: str, facts_of: Callable[[Path, Recipe, str, int, int], Facts]) -> Preset:
+    def open_(dump: Dump) -> Sequence[Clip]:
+        def facts(sequence: str, recipe: Recipe, width: int, height: int) -> Facts:
+            return facts_of(dump.source, recipe, sequence, width, height)
+
+        return _open_by_recipe(name, dump, facts)
+
+    return open_
+
+
+def _open_by_recipe(name: str, dump: Dump, facts: MakeFacts) -> Sequence[Clip]:
+    source, reference = dump.source, dump.reference
+    clips = open_dump(source, load_recipe(name, dump.recipe), reference, facts, name)
     missing = [path for clip in clips for path in clip.missing()]
-    if missing and not skip_broken:
+    if missing and not dump.skip_broken:
         raise ValueError(
             f"{source}: {len(missing)} of the images are missing, the first is {missing[0]}. Dump or copy them; "
             "--skip-broken leaves their frames out."
@@ -91,6 +106,35 @@ def _open(
     if reference is not None:
         folders["reference_folder"] = str(reference.resolve())
     return [dataclasses.replace(clip, source={**clip.source, **folders}) for clip in clips]
+
+
+def _metadata(read: Callable[[Path, int, int], Facts], otherwise: Callable[[int, int], Facts]) -> Any:
+    """Facts from the file that the recipe names, or else ``otherwise``."""
+
+    def facts(source: Path, recipe: Recipe, sequence: str, width: int, height: int) -> Facts:
+        if "metadata" in recipe.files:
+            return read(source / fill(recipe.files["metadata"], sequence), width, height)
+        return otherwise(width, height)
+
+    return facts
+
+
+def _nothing(width: int, height: int) -> Facts:
+    return no_facts
+
+
+def _from_header(width: int, height: int) -> Facts:
+    return lambda number, header: header_facts(header, width, height)
+
+
+PRESETS: Mapping[str, Preset] = {
+    "blender": _blender,
+    "unreal": _by_recipe("unreal", _metadata(generic_facts, _from_header)),
+    "extranet": _by_recipe("extranet", _metadata(generic_facts, _nothing)),
+    "arm-nss": _by_recipe("arm-nss", _metadata(arm_facts, _nothing)),
+    "generic": _by_recipe("generic", _metadata(generic_facts, _nothing)),
+}
+"""Producers whose conventions are known, by name."""
 
 
 def import_dataset(
@@ -130,7 +174,7 @@ def import_dataset(
     if preset not in PRESETS:
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
     recipe, reference = (None if path is None else Path(path) for path in (recipe, reference))
-    clips = _open(Path(source), preset, recipe, reference, workers, skip_broken)
+    clips = PRESETS[preset](Dump(Path(source), recipe, reference, skip_broken, workers))
     if name is not None:
         if len(clips) > 1:
             raise ValueError(f"name: the dump has {len(clips)} sequences, which keep their names. Leave it out.")
@@ -139,8 +183,8 @@ def import_dataset(
     kept, about = _kept(Path(out), preset, clips, splits)
     numbers = {name: info.numbers for name, info in kept.items()}
     segments = split_segments({**numbers, **{clip.name: clip.numbers for clip in clips}}, splits)
-    _check_out(Path(out), clips, kept, skip_broken)
-    written = _write(out, clips, skip_broken, workers, on_frame)
+    opened = _open_all(Path(out), clips, kept, skip_broken)
+    written = _write(opened, skip_broken, workers, on_frame)
     numbers |= {name: part.info.numbers for name, part in written.items()}
     skipped = {name: {**gaps[name], **part.skipped} for name, part in written.items()}
     skipped = {name: dict(sorted(frames.items())) for name, frames in skipped.items() if frames}
@@ -198,24 +242,26 @@ def _kept(
     return kept, about
 
 
-def _check_out(out: Path, clips: Sequence[Clip], kept: Mapping[str, SequenceInfo], skip_broken: bool) -> None:
-    """Refuse what cannot end well before anything is written."""
-    infos = list(kept.values())
+def _open_all(out: Path, clips: Sequence[Clip], kept: Mapping[str, SequenceInfo], skip_broken: bool) -> list[OpenClip]:
+    """Open every clip; what cannot end well is refused before anything is written."""
+    infos, opened = list(kept.values()), []
     for clip in clips:
         folder = (out / clip.name).resolve()
-        for parent in {path.parent for number in clip.numbers for path in files_of(clip, number)}:
+        for parent in {path.parent for number in clip.numbers for path in clip.files(number)}:
             if parent.resolve() == folder:
                 raise ValueError(
                     f"{folder}: the dump is there, nothing is written into it. Choose another output folder."
                 )
-        writer, _ = open_clip(out, clip, functools.partial(made_from, clip))
+        opened.append(open_clip(out, clip))
         if len(clips) + len(kept) > 1:
-            infos.append(writer.info or _first_frame(clip, writer, skip_broken))
+            infos.append(opened[-1].writer.info or _first_frame(opened[-1], skip_broken))
     check_agreement(out / "dataset.json", infos)
+    return opened
 
 
-def _first_frame(clip: Clip, writer: SequenceWriter, skip_broken: bool) -> SequenceInfo:
+def _first_frame(opened: OpenClip, skip_broken: bool) -> SequenceInfo:
     """What the first frame that is not broken says about size and channels."""
+    clip, writer, _ = opened
     reasons = []
     for number in clip.numbers:
         try:
@@ -228,21 +274,15 @@ def _first_frame(clip: Clip, writer: SequenceWriter, skip_broken: bool) -> Seque
     raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {reasons[0]}")
 
 
-def _write(
-    out: str | os.PathLike, clips: Sequence[Clip], skip_broken: bool, workers: int | None, on_frame: OnFrame
-) -> dict[str, Written]:
-    done, total = 0, sum(len(clip.numbers) for clip in clips)
+def _write(opened: Sequence[OpenClip], skip_broken: bool, workers: int | None, on_frame: OnFrame) -> dict[str, Written]:
+    done, total = 0, sum(len(one.clip.numbers) for one in opened)
 
     def step(count: int) -> None:
         nonlocal done
         done += count
         on_frame(done, total)
 
-    def write(clip: Clip) -> Written:
-        known = functools.partial(made_from, clip)
-        return write_clip(out, clip, made_from=known, skip_broken=skip_broken, workers=workers, on_frames=step)
-
-    return {clip.name: write(clip) for clip in clips}
+    return {one.clip.name: write_clip(one, skip_broken=skip_broken, workers=workers, on_frames=step) for one in opened}
 
 
 def _totals(infos: Sequence[SequenceInfo]) -> dict[str, int]:

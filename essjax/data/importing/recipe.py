@@ -12,12 +12,12 @@ from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
-from essjax.data.layout import SUFFIXES
+from essjax.buffers import BUFFERS
 
 RECIPES = Path(__file__).parent / "recipes"
 REQUIRED = ("color", "depth", "motion")
 """Images without which there is no dataset."""
-IMAGES = tuple(name for name in SUFFIXES if name not in ("valid", "steady"))
+IMAGES = tuple(BUFFERS)
 
 
 def _choice(*values: str, default: str | None = None) -> Any:
@@ -272,7 +272,7 @@ def _files(where: str, content: Any) -> dict[str, str]:
 def _channels(where: str, content: Any) -> dict[str, tuple[str, ...]]:
     channels = {}
     for image, names in _strings(where, content, (*IMAGES, "reference")).items():
-        count = 3 if image == "reference" else len(SUFFIXES[image])
+        count = 3 if image == "reference" else BUFFERS[image].channels
         if not (isinstance(names, list) and len(names) == count and all(isinstance(n, str) for n in names)):
             raise ValueError(f"{where} {image}: expected a list of {count} channel names, got {names!r}.")
         channels[image] = tuple(names)

@@ -1,10 +1,12 @@
 """Write clips into a dataset: frames are converted by threads, side by side, and listed in order, a few at a time."""
 
+import hashlib
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -51,13 +53,39 @@ class Clip(Protocol):
         """What the dataset keeps about where it comes from; JSON types."""
         ...
 
+    def files(self, number: int) -> list[Path]:
+        """What one frame is read from, there or not."""
+        ...
+
+    def said(self, number: int) -> str:
+        """What is known about one frame beside its files, as far as it matters to it."""
+        ...
+
     def convert(self, number: int) -> Converted:
         """Read and convert one frame; called by several threads. A ValueError that names the file: it is broken."""
         ...
 
 
-MadeFrom = Callable[[int], str]
-"""Number of a frame -> a short text that changes if what the frame is made from does."""
+class OpenClip(NamedTuple):
+    """A clip, the writer of its sequence, and the frames that are still to be written."""
+
+    clip: Clip
+    writer: SequenceWriter
+    pending: list[int]
+
+
+def made_from(clip: Clip, number: int) -> str:
+    """A short text that changes with the name, size or date of a file of the frame, and with its metadata."""
+    files = [(path.name, *_size_and_date(path)) for path in clip.files(number)]
+    return hashlib.blake2b(repr((files, clip.said(number))).encode(), digest_size=8).hexdigest()
+
+
+def _size_and_date(path: Path) -> tuple[int, int]:
+    try:
+        stat = path.stat()
+    except FileNotFoundError:
+        return -1, -1
+    return stat.st_size, stat.st_mtime_ns
 
 
 class BrokenFrame(ValueError):
@@ -75,10 +103,8 @@ class Written(NamedTuple):
     skipped: Mapping[int, str]
 
 
-def open_clip(
-    root: str | os.PathLike, clip: Clip, made_from: MadeFrom = lambda number: ""
-) -> tuple[SequenceWriter, list[int]]:
-    """The writer of a clip's sequence, and the frames that are still to be written; nothing is written yet.
+def open_clip(root: str | os.PathLike, clip: Clip) -> OpenClip:
+    """Open the sequence that a clip is to be written to; nothing is written yet.
 
     A sequence may be there: part of the clip, all of it, or all but the frames that were rendered since. Broken frames
     behind its last frame are tried again.
@@ -86,27 +112,26 @@ def open_clip(
     Args:
       root: the dataset's folder.
       clip: the frames.
-      made_from: of each frame.
 
     Raises:
       ValueError: the sequence there was made in another way or from other frames, which a second import cannot mend.
     """
     writer = SequenceWriter(root, clip.name, source=clip.source)
     if writer.info is None:
-        return writer, list(clip.numbers)
+        return OpenClip(clip, writer, list(clip.numbers))
     last, numbers = writer.info.numbers[-1], set(clip.numbers)
     known = {record["number"]: record for record in (*writer.info.skipped, *writer.info.frames)}
     for number, record in known.items():
         if number not in numbers and "reason" not in record:
             _refuse(writer, f"frame {number} was imported before, and is not there any more")
-        if number in numbers and number <= last and record.get("made_from") != made_from(number):
+        if number in numbers and number <= last and record.get("made_from") != made_from(clip, number):
             was = f", left out as broken ({record['reason']})," if "reason" in record else ""
             _refuse(writer, f"frame {number}{was} was changed since the import before: its files or its metadata")
     writer.skipped = {number: record for number, record in writer.skipped.items() if number in numbers}
     between = [number for number in clip.numbers if number < last and number not in known]
     if between:
         _refuse(writer, f"frame {between[0]} was not there at the import before, but frame {last} was")
-    return writer, [number for number in clip.numbers if number > last]
+    return OpenClip(clip, writer, [number for number in clip.numbers if number > last])
 
 
 def _refuse(writer: SequenceWriter, what: str) -> None:
@@ -117,34 +142,30 @@ def _refuse(writer: SequenceWriter, what: str) -> None:
 
 
 def write_clip(
-    root: str | os.PathLike,
-    clip: Clip,
+    opened: OpenClip,
     *,
-    made_from: MadeFrom = lambda number: "",
     skip_broken: bool = False,
     workers: int | None = None,
     on_frames: Callable[[int], Any] = lambda count: None,
 ) -> Written:
-    """Convert a clip into a finished sequence; goes on behind the last frame that is there, see ``open_clip``.
+    """Convert a clip into a finished sequence; goes on after the last frame that is there, see ``open_clip``.
 
     Memory holds ``2 * workers`` frames, whatever the clip's length.
 
     Args:
-      root: the dataset's folder.
-      clip: the frames.
-      made_from: of each frame.
+      opened: the clip.
       skip_broken: leave broken frames out; the next one becomes a cut. They stop the import otherwise.
       workers: threads; None: one per core.
       on_frames: called with the number of frames that are done since the last call.
 
     Raises:
-      ValueError: as ``open_clip``; a frame is broken (and ``skip_broken`` is off); no frame is left, or most differ
+      ValueError: a frame is broken (and ``skip_broken`` is off); no frame is left, or most differ
         from the first in size or channels; a file cannot be written.
       OSError: a file cannot be read or written.
     """
-    writer, pending = open_clip(root, clip, made_from)
+    clip, writer, pending = opened
     on_frames(len(clip.numbers) - len(pending))
-    frames = _prepared(clip, writer, pending, made_from, workers or os.cpu_count() or 1)
+    frames = _prepared(opened, workers or os.cpu_count() or 1)
     with closing(frames), _saved_at_last(writer):
         for index, (number, future) in enumerate(frames):
             try:
@@ -188,13 +209,12 @@ def _saved_at_last(writer: SequenceWriter) -> Iterator[None]:
             writer.save()
 
 
-def _prepared(
-    clip: Clip, writer: SequenceWriter, numbers: list[int], made_from: MadeFrom, workers: int
-) -> Generator[tuple[int, Future[PreparedFrame]], None, None]:
+def _prepared(opened: OpenClip, workers: int) -> Generator[tuple[int, Future[PreparedFrame]], None, None]:
     """Frames whose images are written, in order, ``2 * workers`` on their way."""
+    clip, writer, numbers = opened
 
     def work(number: int) -> PreparedFrame:
-        before = made_from(number)  # a file that changes while it is read counts as changed
+        before = made_from(clip, number)  # a file that changes while it is read counts as changed
         try:
             frame, reference, counts = clip.convert(number)
             writer.describe(number, frame, reference)

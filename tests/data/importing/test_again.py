@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from essjax.data import exr, import_dataset, read_dataset, read_sequence
-from essjax.data.importing.stream import write_clip
+from essjax.data.importing.stream import open_clip, write_clip
 from tests.data.importing.dumps import OUR_RULES, rgb, truth, write
 from tests.data.importing.test_blender import FIRST, LAST, write_dump
 from tests.data.importing.test_presets import write_extranet
@@ -274,10 +274,10 @@ def test_a_full_disk_is_not_a_broken_frame(tmp_path, monkeypatch):
     with pytest.raises(
         ValueError, match=r"hr\.0003\.exr: cannot write the file\. Is the folder there, the disk full\?$"
     ):
-        write_clip(tmp_path, clip, skip_broken=True, workers=2)
+        write_clip(open_clip(tmp_path, clip), skip_broken=True, workers=2)
     assert not list(tmp_path.rglob("*.0003.exr"))
     monkeypatch.undo()
-    written = write_clip(tmp_path, clip, skip_broken=True, workers=2)
+    written = write_clip(open_clip(tmp_path, clip), skip_broken=True, workers=2)
     assert written.info.numbers == tuple(range(6)) and not written.skipped
 
 
@@ -294,4 +294,4 @@ def test_an_odd_first_frame_does_not_make_the_others_broken(tmp_path):
     )
     for _ in range(2):
         with pytest.raises(ValueError, match=message):
-            write_clip(tmp_path, Clip(known), skip_broken=True)
+            write_clip(open_clip(tmp_path, Clip(known)), skip_broken=True)

@@ -12,7 +12,7 @@ import pytest
 from essjax.data import import_dataset, read_dataset, read_sequence
 from essjax.data.importing.files import find_frames
 from essjax.data.importing.splits import fit_segments, split_segments
-from essjax.data.importing.stream import Converted, write_clip
+from essjax.data.importing.stream import Converted, open_clip, write_clip
 from essjax.frames import select_time
 from tests.data.importing.dumps import imported, truth
 from tests.data.importing.test_presets import write_extranet
@@ -32,6 +32,12 @@ class FakeClip:
     def numbers(self):
         return tuple(range(len(self.known.frames.cut)))
 
+    def files(self, number):
+        return []
+
+    def said(self, number):
+        return ""
+
     def convert(self, number):
         self.alive.append(number)
         time.sleep(0.02 if number % 2 == 0 else 0.0)
@@ -44,7 +50,7 @@ class FakeClip:
 def test_frames_are_listed_in_order_whatever_thread_is_first(tmp_path):
     known = truth(T=9)
     done = []
-    written = write_clip(tmp_path, FakeClip(known), workers=4, on_frames=done.append)
+    written = write_clip(open_clip(tmp_path, FakeClip(known)), workers=4, on_frames=done.append)
     assert written.info.numbers == tuple(range(9)) and not written.skipped and sum(done) == 9
     assert [record["notes"]["negative"] for record in written.info.frames] == list(range(9))
 
@@ -61,7 +67,7 @@ def test_only_a_few_frames_are_in_memory(tmp_path):
             return super().convert(number)
 
     clip = Slow(known)
-    thread = threading.Thread(target=write_clip, args=(tmp_path, clip), kwargs={"workers": 2})
+    thread = threading.Thread(target=write_clip, args=(open_clip(tmp_path, clip),), kwargs={"workers": 2})
     thread.start()
     time.sleep(0.4)
     assert sorted(clip.alive) == [1, 2, 3]
@@ -75,24 +81,24 @@ def test_a_broken_frame_stops_the_import_and_leaves_nothing_half_written(tmp_pat
     with pytest.raises(
         ValueError, match=r"sequence a, frame 3: lr\.0003\.exr: the file is truncated\. \(--skip-broken"
     ):
-        write_clip(tmp_path, clip, workers=3)
+        write_clip(open_clip(tmp_path, clip), workers=3)
     listed = [r["number"] for r in json.loads((tmp_path / "a" / "sequence.json").read_text())["frames"]]
     assert listed == [0, 1, 2]
     assert sorted(p.name for p in (tmp_path / "a").glob("*.exr")) == [
         f"{k}.000{n}.exr" for k in ("hr", "lr") for n in range(3)
     ]
     assert not list(tmp_path.rglob("*.tmp"))
-    whole = write_clip(tmp_path, FakeClip(truth(T=8)), workers=3)
+    whole = write_clip(open_clip(tmp_path, FakeClip(truth(T=8))), workers=3)
     assert whole.info.numbers == tuple(range(8)) and whole.info.complete
 
 
 def test_broken_frames_are_left_out_and_a_cut_follows(tmp_path):
-    written = write_clip(tmp_path, FakeClip(truth(T=8), broken=(0, 3, 4)), skip_broken=True)
+    written = write_clip(open_clip(tmp_path, FakeClip(truth(T=8), broken=(0, 3, 4))), skip_broken=True)
     assert written.info.numbers == (1, 2, 5, 6, 7)
     assert [record["cut"] for record in written.info.frames] == [True, False, True, False, False]
     assert list(written.skipped) == [0, 3, 4] and "truncated" in written.skipped[3]
     with pytest.raises(ValueError, match=r"sequence b: all frames are broken\. The first: lr\.0000\.exr"):
-        write_clip(tmp_path, FakeClip(truth(T=2), name="b", broken=(0, 1)), skip_broken=True)
+        write_clip(open_clip(tmp_path, FakeClip(truth(T=2), name="b", broken=(0, 1))), skip_broken=True)
 
 
 def test_a_frame_of_another_size_is_broken_too(tmp_path):
@@ -103,7 +109,7 @@ def test_a_frame_of_another_size_is_broken_too(tmp_path):
         def convert(self, number):
             return FakeClip(other if number == 1 else known).convert(number)
 
-    written = write_clip(tmp_path, Odd(known), skip_broken=True)
+    written = write_clip(open_clip(tmp_path, Odd(known)), skip_broken=True)
     assert written.info.numbers == (0, 2) and "width changes from 24 to 20" in written.skipped[1]
     assert not list((tmp_path / "a").glob("*.0001.exr"))
 
