@@ -13,8 +13,8 @@ from types import ModuleType
 __version__ = "0.1.0"
 
 __all__ = [
-    "builtin", "cameras", "color", "data", "deploy", "exposure", "frames", "interfaces", "kernels", "labels", "losses",
-    "methods", "metrics", "networks", "rollout", "scenes", "tensors", "train", "typing", "warp",
+    "buffers", "builtin", "cameras", "color", "data", "deploy", "exposure", "frames", "interfaces", "kernels", "labels",
+    "losses", "methods", "metrics", "networks", "rollout", "scenes", "tensors", "train", "typing", "warp",
 ]  # fmt: skip
 
 
