@@ -127,6 +127,7 @@ _COUNTS = {
     "unwritten": ("pixels without a velocity", "motion from cameras"),
     "negative": ("negative colour values", "set to 0"),
     "infinite": ("infinite colour values", "clamped"),
+    "repaired": ("NaN and infinite pixels", "set to the median of their neighbours"),
     "clamped": ("values beyond half's range", "clamped"),
     "outside": ("buffer values outside [0, 1]", "clipped"),
 }
@@ -145,6 +146,8 @@ def _print_report(report: ImportReport) -> None:
     if report.sequence.source.get("reference") == "color":
         table.add_row("reference", "none in the dump: the colour itself, scale 1")
     _console.print(table)
+    for warning in report.warnings:
+        _console.print(f"warning: {warning}.", style="yellow", markup=False, highlight=False, soft_wrap=True)
     for name, frames in report.skipped.items():
         for number, reason in frames.items():
             text = f"left out, a cut follows: {name}, frame {number}: {reason}"
@@ -163,6 +166,7 @@ def import_(
     test: str = "",
     name: str = "",
     skip_broken: bool = False,
+    repair: bool = False,
 ) -> None:
     """Import rendered frames into a dataset, converting their conventions. Interrupted, the same command resumes; a
     clip that has grown, or another clip, is added to the dataset.
@@ -172,7 +176,7 @@ def import_(
     Args:
       source: The folder as the renderer wrote it.
       out: The dataset's folder.
-      preset: The producer's conventions: blender, unreal, extranet, arm-nss or generic.
+      preset: The producer's conventions: blender, unreal, extranet, arm-nss, arm-gym, stssnet or generic.
       recipe: TOML that says a dump's files, channels and conventions, or changes a preset's; generic needs one.
       reference: Folder with the references, named as the preset's colour, where the dump itself has none.
       train: First and last frame to train on, such as 8:19, or names of sequences, such as a,b; give all three or none
@@ -182,6 +186,7 @@ def import_(
       test: The same, to test on; streamed from the clip's start.
       name: Name of the sequence; as in the dump if empty.
       skip_broken: Leave out broken and missing frames (the next one becomes a cut) instead of stopping at them.
+      repair: Mend single NaN and infinite pixels from their neighbours, counted, instead of stopping at their frame.
     """
     _check_folder(out, "OUT")
     given = {"train": train, "validation": validation, "test": test}
@@ -196,6 +201,7 @@ def import_(
             splits=splits or None,
             name=name or None,
             skip_broken=skip_broken,
+            repair=repair,
             on_frame=progress,
         )
     _print_report(report)

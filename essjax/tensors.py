@@ -65,18 +65,26 @@ def _float32(bits: np.ndarray) -> np.ndarray:
 
 
 def _read_safetensors(path: Path, prefix: str) -> dict[str, np.ndarray]:
-    """The format is a JSON header and raw arrays: these lines are less than a dependency."""
-    data = path.read_bytes()
-    header_end = 8 + int.from_bytes(data[:8], "little")
+    return {name: np.array(array) for name, array in map_safetensors(path).items() if name.startswith(prefix)}
+
+
+def map_safetensors(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a safetensors file by name, read from the disk where they are used (bfloat16 at once).
+
+    The format is a JSON header and raw arrays: these lines are less than a dependency.
+    """
+    data = np.memmap(path, np.uint8, mode="r")
+    header_end = 8 + int.from_bytes(data[:8].tobytes(), "little")
     tensors = {}
-    for name, entry in json.loads(data[8:header_end]).items():
-        if name.startswith(prefix) and name != "__metadata__":
-            if entry["dtype"] not in _SAFETENSORS_DTYPES:
-                raise ValueError(f"{name} has dtype {entry['dtype']}, expected {', '.join(_SAFETENSORS_DTYPES)}")
-            begin, end = entry["data_offsets"]
-            raw = data[header_end + begin : header_end + end]
-            array = np.frombuffer(raw, _SAFETENSORS_DTYPES[entry["dtype"]]).reshape(entry["shape"])
-            tensors[name] = _float32(array) if entry["dtype"] == "BF16" else array
+    for name, entry in json.loads(data[8:header_end].tobytes()).items():
+        if name == "__metadata__":
+            continue
+        if entry["dtype"] not in _SAFETENSORS_DTYPES:
+            raise ValueError(f"{name} has dtype {entry['dtype']}, expected {', '.join(_SAFETENSORS_DTYPES)}")
+        begin, end = entry["data_offsets"]
+        raw = data[header_end + begin : header_end + end]
+        array = np.frombuffer(raw, _SAFETENSORS_DTYPES[entry["dtype"]]).reshape(entry["shape"])
+        tensors[name] = _float32(array) if entry["dtype"] == "BF16" else array
     return tensors
 
 

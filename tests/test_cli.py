@@ -177,7 +177,7 @@ def test_bad_input_prints_one_line(tmp_path, capsys, dump):  # noqa: F811
         (["import", tmp_path / "nothing", out], "meta.json: not found."),
         (
             ["import", dump, out, "--preset", "maya"],
-            "error: preset: expected one of blender, unreal, extranet, arm-nss, generic, got",
+            "error: preset: expected one of blender, unreal, extranet, arm-nss, arm-gym, stssnet, generic, got",
         ),
         (["import", dump, out, "--train", "9:x"], "error: --train: expected FIRST:LAST such as 8:19, both included,"),
         (["import", dump, out, "--train", "8:12"], "error: splits: validation, test missing. Give train, validation"),

@@ -186,7 +186,7 @@ def test_recipes_of_the_guide_are_read(tmp_path):
     text = (ROOT / "docs/guides/importing.md").read_text()
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)
     whole = [block for block in blocks if "[files]" in block]
-    assert len(whole) == 1 and len(blocks) > 2
+    assert len(whole) == 2 and len(blocks) > 3
     for block in blocks:
         path = tmp_path / "recipe.toml"
         path.write_text(block)

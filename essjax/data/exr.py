@@ -18,6 +18,7 @@ import numpy as np
 import OpenEXR
 
 from essjax.buffers import DEPTHS, FULL_PRECISION
+from essjax.data.exr_text import readable
 
 HALF_MAX = 65504.0
 SMALL_IMAGE = 512 << 20
@@ -60,10 +61,21 @@ def _check_file(path: Path) -> None:
 
 
 def _open(path: Path, *, header_only: bool) -> list[OpenEXR.Part]:
+    """The parts of a file. Their attributes are read here, while a copy of the file may be needed for them."""
     try:
-        return OpenEXR.File(str(path), separate_channels=True, header_only=header_only, num_threads=0).parts
-    except (RuntimeError, ValueError, TypeError, MemoryError) as error:  # UnicodeDecodeError is a ValueError
+        return _parts(path, header_only)
+    except UnicodeDecodeError:
+        with readable(path) as copy:
+            return _parts(copy, header_only)
+    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
         raise ValueError(f"{path}: the file is damaged ({error}). Download or render it again.") from error
+
+
+def _parts(path: Path, header_only: bool) -> list[OpenEXR.Part]:
+    parts = OpenEXR.File(str(path), separate_channels=True, header_only=header_only, num_threads=0).parts
+    for part in parts:
+        part.header  # noqa: B018 (it is decoded when it is asked for)
+    return parts
 
 
 def _list(names: Iterable[str], limit: int = SHOWN) -> str:
@@ -153,7 +165,9 @@ def _headers(path: Path) -> tuple[list[_Part], dict]:
     try:
         parts = [_part(part) for part in raw]
         header = dict(raw[0].header)
-    except (KeyError, ValueError, TypeError, IndexError) as error:  # names that are not UTF-8, missing attributes
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: the attribute 'channels' in the header is not UTF-8. Write it in ASCII.") from error
+    except (KeyError, ValueError, TypeError, IndexError) as error:  # missing attributes
         raise ValueError(f"{path}: the file is damaged ({error}). Download or render it again.") from error
     for part in parts:
         _check_part(path, part)

@@ -161,7 +161,7 @@ def write_json(path: Path, content: Mapping) -> None:
 def read_json(path: Path) -> dict:
     """Read a JSON object; missing and damaged files are ValueErrors that name the file."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: not found. Is this the right folder, and is the data complete?") from error
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""``arm-nss``: the metadata of Arm's captures, one ``<sequence>.json`` each.
+"""``arm-nss``: the metadata of Arm's captures, one ``<sequence>.json`` each; ``arm-gym``: their safetensors.
 
 Layout and fields: "NSS Dataset Specification" of Arm's Neural Graphics Model Gym, version 1.0.1.
 """
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from essjax.data.importing.facts import Facts, FrameFacts, lookup
+from essjax.data.importing.planes import stacked_facts
 from essjax.data.layout import read_json
 
 RATIO = re.compile(r"x(\d+(?:_\d+)?)_index")
@@ -84,5 +85,36 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
             raise ValueError(
                 f"{path}, frame {number}: a field is missing or has the wrong form ({error!r})."
             ) from error
+
+    return facts
+
+
+def gym_facts(path: Path, width: int, height: int) -> Facts:
+    """Jitter, exposure, cuts and planes from the safetensors that the model gym makes of a capture.
+
+    All arrays have the frame on their first axis: ``jitter`` (y, x) in pixels, ``exposure`` as its natural logarithm,
+    ``zNear``, ``zFar``, ``infinite_zFar``, ``camera_cut``. Depth is stored forward, whatever it was captured as.
+
+    Raises:
+      ValueError: the file is missing or damaged.
+    """
+    try:
+        arrays = stacked_facts(path)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected a safetensors file of the model gym, cannot read it ({error}).") from error
+
+    def facts(number: int, header: Mapping[str, Any]) -> FrameFacts:
+        try:
+            of = lambda name: np.asarray(arrays[name][number], np.float64).reshape(-1)
+            return FrameFacts(
+                jitter=of("jitter")[::-1].astype(np.float32),
+                exposure=float(np.exp(of("exposure")[0])) if "exposure" in arrays else None,
+                cut="camera_cut" in arrays and bool(of("camera_cut")[0]),
+                near=float(of("zNear")[0]),
+                far=np.inf if of("infinite_zFar")[0] else float(of("zFar")[0]),
+                depth_kind="forward",
+            )
+        except (KeyError, IndexError) as error:
+            raise ValueError(f"{path}, frame {number}: an array is missing or too short ({error!r}).") from error
 
     return facts

@@ -17,8 +17,8 @@ import numpy as np
 
 from essjax.cameras import Camera, pixel_positions, unproject
 from essjax.data import exr
-from essjax.data.importing.dump import camera_motion
 from essjax.data.importing.facts import make_camera
+from essjax.data.importing.motion import camera_motion
 from essjax.data.importing.stream import Converted
 from essjax.data.layout import read_json
 from essjax.frames import Frame, GBuffers

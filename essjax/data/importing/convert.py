@@ -10,8 +10,6 @@ VELOCITY_ZERO = 32767 / 65535
 """What Unreal's 16-bit velocity texture holds where nothing moves."""
 VELOCITY_RANGE = 0.499 * 0.5
 """Encoded velocity per unit of normalised device coordinates."""
-RAW_VELOCITY = ("unreal4", "unreal5")
-"""Encodings in which 0 says that the engine wrote no velocity: there only the camera moves."""
 SHORT_NORMAL = 1e-3
 """Shorter than this is no normal."""
 
@@ -44,6 +42,23 @@ def decode_velocity(encoded: np.ndarray, encoding: str) -> tuple[np.ndarray, np.
     if encoding == "unreal5":
         velocity = 0.5 * velocity * np.abs(velocity)
     return velocity * written, written
+
+
+def unpack(stored: np.ndarray, components: int, low: int, high: int) -> np.ndarray:
+    """Numbers in [0, 1] that were packed into bytes: ``(b0 + b1 / D + b2 / D^2 + ...) / D'``.
+
+    Of two bytes, D = 256 and D' = 255 stand for 16 bits over 255.996; 255 and 255 is what a shader writes that splits a
+    number into its first byte and the rest; 256 and 256 is fixed point, of four bytes 32 bits.
+
+    Args:
+      stored: ``[H, W, components * n]`` uint8, the n bytes of a component one after the other, high byte first.
+      components: numbers per pixel.
+      low: D.
+      high: D'.
+    """
+    each = stored.reshape(*stored.shape[:2], components, -1).astype(np.float64)
+    weights = 1.0 / (high * float(low) ** np.arange(each.shape[-1]))
+    return (each @ weights).astype(np.float32)
 
 
 def to_pixels(
@@ -129,6 +144,23 @@ def unit_normals(stored: np.ndarray, encoding: str) -> np.ndarray:
     vectors = stored if encoding == "signed" else 2.0 * stored - 1.0
     length = np.sqrt(np.square(vectors).sum(-1, keepdims=True))
     return np.where(length > SHORT_NORMAL, vectors / np.maximum(length, SHORT_NORMAL), 0.0).astype(np.float32)
+
+
+def at_samples(image: np.ndarray, width: int, height: int, jitter: np.ndarray) -> np.ndarray:
+    """An image of a whole multiple of the frame's size, read at the pixel that each sample of the frame lies in.
+
+    Args:
+      image: ``[s*H, s*W, C]``; averaging would mix surfaces.
+      width: of the frame.
+      height: of the frame.
+      jitter: ``[2]`` pixels of the frame: the sample lies at pixel centre + jitter.
+    """
+    scale = image.shape[0] // height
+    if scale == 1:
+        return image
+    x, y = (np.arange(size) + 0.5 + offset for size, offset in zip((width, height), jitter, strict=True))
+    columns, rows = (np.clip((p * scale).astype(int), 0, scale * len(p) - 1) for p in (x, y))
+    return image[rows[:, None], columns[None]]
 
 
 def radical_inverse(index: int, base: int) -> float:

@@ -5,29 +5,20 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from essjax.cameras import Camera, pixel_positions, static_motion
-from essjax.data import exr
 from essjax.data.importing import convert
 from essjax.data.importing.facts import Facts, FrameFacts
-from essjax.data.importing.files import fill, find_frames
-from essjax.data.importing.images import buffer, radiance, read_images, view_depth
+from essjax.data.importing.files import fill, find_frames, index_frames, unlisted
+from essjax.data.importing.images import Stored, buffer, radiance, read_images, repair, view_depth
+from essjax.data.importing.motion import frame_motion
+from essjax.data.importing.planes import channels_in, count_frames
 from essjax.data.importing.recipe import Recipe
 from essjax.data.importing.stream import Converted
 from essjax.frames import Frame, gbuffers_of
-from essjax.typing import Jitter, Motion, Plane
 
 MakeFacts = Callable[[str, Recipe, int, int], Facts]
 """(sequence as in the file names, recipe, width, height) -> facts of its frames."""
-
-
-@jax.jit
-def camera_motion(camera: Camera, previous: Camera, jitter: Jitter, depth: Plane) -> Motion:
-    """Motion of a static world, at the jittered samples."""
-    height, width = depth.shape[:2]
-    return static_motion(camera, previous, pixel_positions(height, width, jitter), depth)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,7 +27,8 @@ class RecipeClip:
 
     Attributes:
       name: of the sequence to write.
-      digits: frame number -> as written in the file names.
+      digits: frame number -> as written in the names of the colour's files.
+      others: the same of images whose files are named otherwise, as far as their numbers are written in another way.
       source: what the dataset keeps about where it comes from.
       recipe: files, channels and conventions.
       root: the dump's folder.
@@ -44,6 +36,7 @@ class RecipeClip:
       sequence: the name within the file names.
       images: those that are imported, a subset of ``recipe.channels``.
       facts: of each frame.
+      repair: mend single NaN and infinite pixels, counted as "repaired".
     """
 
     name: str
@@ -55,6 +48,8 @@ class RecipeClip:
     sequence: str
     images: tuple[str, ...]
     facts: Facts
+    others: Mapping[str, Mapping[int, str]] = dataclasses.field(default_factory=dict)
+    repair: bool = False
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -64,7 +59,8 @@ class RecipeClip:
     def path(self, image: str, number: int) -> Path:
         """The file of an image, or of the "reference"."""
         root = self.reference_root if image == "reference" and self.reference_root else self.root
-        return root / fill(self.recipe.pattern(image), self.sequence, self.digits[number])
+        digits = self.others.get(image, {}).get(number, self.digits[number])
+        return root / fill(self.recipe.pattern(image), self.sequence, digits)
 
     def files(self, number: int) -> list[Path]:
         """What one frame is read from, there or not."""
@@ -91,20 +87,24 @@ class RecipeClip:
 
     def convert(self, number: int) -> Converted:
         """Read and convert one frame; a ValueError names the file or channel."""
-        images, header = read_images(
-            {image: (self.path(image, number), self.recipe.channels[image]) for image in self.images}
-        )
+        images, header, repaired = self._read(number, self.images)
         facts = self.facts(number, header)
         height, width = images["color"].shape[:2]
         jitter = self._jitter(number, facts, width, height)
+        stored_motion = images.pop("motion")
+        images = {name: convert.at_samples(image, width, height, jitter) for name, image in images.items()}
         color, counts = radiance(images.pop("color"), self.recipe, facts)
         depth = view_depth(images.pop("depth"), self.recipe, facts, jitter)
         hit = np.isfinite(depth)
         counts |= {"pixels": hit.size, "background": int(hit.size - np.count_nonzero(hit))}
         cut = facts.cut or number - 1 not in self.digits
-        motion, unwritten = self._motion(images.pop("motion"), number, facts, jitter, depth, cut)
-        if self.recipe.motion.encoding in convert.RAW_VELOCITY:
-            counts["unwritten"] = unwritten
+        before = None if cut else self._jitter_before(number, width, height)
+        motion, unwritten, still = frame_motion(
+            stored_motion, images.pop("written", None), self.recipe.motion, facts, jitter, before, depth,
+            self.path("motion", number),
+        )  # fmt: skip
+        rare = {"repaired": repaired, "unwritten": unwritten, "still": still}
+        counts |= {name: count for name, count in rare.items() if count}
         converted = {name: buffer(name, image, hit, self.recipe) for name, image in images.items()}
         buffers = {name: image for name, (image, _) in converted.items()}
         counts["outside"] = sum(outside for _, outside in converted.values())
@@ -120,10 +120,26 @@ class RecipeClip:
         )
         if self.reference_root is None:
             return Converted(frame, color, counts)
-        path = self.path("reference", number)
-        stored, _ = read_images({"reference": (path, self.recipe.channels["reference"])})
+        stored, _, repaired = self._read(number, ("reference",))
         reference, more = radiance(stored["reference"], self.recipe, facts)
-        return Converted(frame, reference, {**counts, **{name: counts[name] + more[name] for name in more}})
+        more |= {"repaired": repaired} if repaired else {}
+        return Converted(frame, reference, {**counts, **{name: counts.get(name, 0) + more[name] for name in more}})
+
+    def _read(self, number: int, names: Iterable[str]) -> tuple[dict[str, np.ndarray], Mapping[str, Any], int]:
+        """Images as they are stored, the header of the first, and how many pixels were mended."""
+        recipe = self.recipe
+        wanted = {
+            name: Stored(self.path(name, number), recipe.channels[name], number if recipe.stacked(name) else None)
+            for name in names
+        }
+        images, header = read_images(wanted, recipe.packings)
+        return images, header, sum(repair(name, image) for name, image in images.items()) if self.repair else 0
+
+    def _jitter_before(self, number: int, width: int, height: int) -> np.ndarray:
+        """Jitter of the frame before; asked for only where motion holds the difference."""
+        if not self.recipe.motion.jittered:
+            return np.zeros(2, np.float32)
+        return self._jitter(number - 1, self.facts(number - 1, {}), width, height)
 
     def _jitter(self, number: int, facts: FrameFacts, width: int, height: int) -> np.ndarray:
         rule = self.recipe.jitter
@@ -140,35 +156,9 @@ class RecipeClip:
         pixels = convert.to_pixels(stored, rule.unit, width, height, y=rule.y)
         return convert.sample_offset(pixels, rule.sign).astype(np.float32)
 
-    def _motion(
-        self, stored: np.ndarray, number: int, facts: FrameFacts, jitter: np.ndarray, depth: np.ndarray, cut: bool
-    ) -> tuple[np.ndarray, int]:
-        """Motion in essjax's convention, and how many pixels had none of their own."""
-        rule, (height, width) = self.recipe.motion, stored.shape[:2]
-        written = np.ones((1, 1, 1), bool)
-        if rule.encoding != "plain":
-            stored, written = convert.decode_velocity(stored, rule.encoding)
-        pixels = convert.to_pixels(stored * np.float32(rule.scale), rule.unit, width, height, x=rule.x, y=rule.y)
-        if rule.resolution is not None:
-            pixels *= np.asarray([width / rule.resolution[0], height / rule.resolution[1]], np.float32)
-        motion = convert.to_previous(pixels, rule.sign)
-        if rule.jittered and not cut:
-            before = self._jitter(number - 1, self.facts(number - 1, {}), width, height)
-            motion = convert.without_jitter(motion, jitter, before)
-        if written.all() or cut:
-            return np.where(written, motion, 0.0).astype(np.float32), int((~written).sum())
-        if facts.camera is None or facts.previous is None:
-            raise ValueError(
-                f"{self.path('motion', number)}: {int((~written).sum())} pixels have no velocity: there the motion "
-                "follows from the cameras, which the file's header does not hold. Let the engine write velocity for "
-                "everything, or give the cameras ([files] metadata)."
-            )
-        static = np.asarray(camera_motion(facts.camera, facts.previous, jitter, depth))
-        return np.where(written, motion, static), int((~written).sum())
-
 
 def open_dump(
-    source: Path, recipe: Recipe, reference: Path | None, make_facts: MakeFacts, preset: str
+    source: Path, recipe: Recipe, reference: Path | None, make_facts: MakeFacts, preset: str, *, repair: bool = False
 ) -> list[RecipeClip]:
     """The clips of a dump, in order of their names.
 
@@ -178,13 +168,15 @@ def open_dump(
       reference: folder of the references; None: the recipe's, or else the colour.
       make_facts: of one sequence.
       preset: name, to be recorded.
+      repair: see ``RecipeClip``.
 
     Raises:
       ValueError: no frames, or files are missing.
     """
-    found = find_frames(source, recipe.pattern("color"))
+    found = _numbered(source, recipe)
     reference_root = reference or (source if "reference" in recipe.files else None)
-    first = {sequence: _first_readable(source, recipe, sequence, digits) for sequence, digits in found.items()}
+    others = {name: _other_digits(source, reference_root, recipe, name, digits) for name, digits in found.items()}
+    first = {name: _first_readable(source, recipe, name, digits, others[name]) for name, digits in found.items()}
     present = [image for image in recipe.channels if all(image in images for images, _ in first.values())]
     clips = []
     for sequence, digits in found.items():
@@ -203,9 +195,45 @@ def open_dump(
                 sequence=sequence,
                 images=tuple(present),
                 facts=facts,
+                others=others[sequence],
+                repair=repair,
             )
         )
     return clips
+
+
+def _numbered(source: Path, recipe: Recipe) -> dict[str, dict[int, str]]:
+    """Sequence -> frame number -> digits, of frames in files of their own or all in one."""
+    found = find_frames(source, recipe.pattern("color"))
+    if not recipe.stacked("color"):
+        return found
+    count = lambda name: count_frames(source / fill(recipe.pattern("color"), name), recipe.channels["color"][0])
+    return {name: {number: str(number) for number in range(count(name))} for name in found}
+
+
+def _other_digits(
+    source: Path, reference_root: Path | None, recipe: Recipe, sequence: str, digits: Mapping[int, str]
+) -> dict[str, dict[int, str]]:
+    """Image -> number -> digits, where an image's files pad their numbers otherwise than the colour's do."""
+    others = {}
+    for image in (*recipe.channels, *(("reference",) if reference_root else ())):
+        pattern, root = recipe.pattern(image), reference_root if image == "reference" and reference_root else source
+        if recipe.stacked(image) or (pattern == recipe.pattern("color") and root == source):
+            continue
+        written = index_frames(root, pattern).get(sequence, {})
+        different = {number: text for number, text in written.items() if digits.get(number, text) != text}
+        if different:
+            others[image] = different
+    return others
+
+
+def unlisted_files(clips: Iterable[RecipeClip]) -> list[str]:
+    """Files beside those of the clips that nothing takes; they may be frames under another name."""
+    found: dict[str, None] = {}
+    for root, recipe in {clip.root: clip.recipe for clip in clips}.items():
+        names = ("color", *recipe.channels, *(("reference",) if "reference" in recipe.files else ()))
+        found |= dict.fromkeys(unlisted(root, [recipe.pattern(name) for name in names]))
+    return list(found)
 
 
 def _dilated(facts: Facts, numbers: Iterable[int]) -> bool:
@@ -219,15 +247,21 @@ def _dilated(facts: Facts, numbers: Iterable[int]) -> bool:
 
 
 def _first_readable(
-    source: Path, recipe: Recipe, sequence: str, digits: Mapping[int, str]
+    source: Path,
+    recipe: Recipe,
+    sequence: str,
+    digits: Mapping[int, str],
+    others: Mapping[str, Mapping[int, str]],
 ) -> tuple[set[str], tuple[int, int]]:
     """Which images the first readable frame of a sequence has, and its (width, height)."""
     error = None
-    for text in digits.values():
-        paths = {image: source / fill(recipe.pattern(image), sequence, text) for image in ("color", *recipe.optional)}
+    for number, text in digits.items():
+        written = {image: others.get(image, {}).get(number, text) for image in ("color", *recipe.optional)}
+        paths = {image: source / fill(recipe.pattern(image), sequence, written[image]) for image in written}
+        frame = number if recipe.stacked("color") else None
         try:
-            files = {path: exr.read(path) for path in dict.fromkeys(paths.values()) if path.is_file()}
-            color = exr.read(paths["color"], recipe.channels["color"])[recipe.channels["color"][0]]
+            files = {path: channels_in(path, frame) for path in dict.fromkeys(paths.values()) if path.is_file()}
+            color = read_images({"color": Stored(paths["color"], recipe.channels["color"], frame)})[0]["color"]
         except ValueError as problem:
             error = error or problem
             continue

@@ -2,8 +2,8 @@
 
 import glob
 import re
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
 
 _PLACEHOLDERS = {"{sequence}": "(?P<sequence>[^/]*?)", "{frame}": r"(?P<frame>\d+)"}
 
@@ -24,30 +24,63 @@ def _regex(pattern: str) -> re.Pattern:
     return re.compile(text)
 
 
-def find_frames(root: Path, pattern: str) -> Mapping[str, Mapping[int, str]]:
-    """Sequence -> frame number -> the digits as they are written in the file name, all sorted.
+def hidden(relative: Path) -> bool:
+    """Whether a file is hidden, as the ``._*`` are that macOS leaves beside each file."""
+    return any(part.startswith(".") for part in relative.parts)
+
+
+def _like(root: Path, pattern: str) -> list[Path]:
+    """Files that a pattern means if anything could stand for the frame; hidden ones are none."""
+    found = (path.relative_to(root) for path in root.glob(fill(glob.escape(pattern), "*", "*")))
+    return sorted(path for path in found if not hidden(path))
+
+
+def index_frames(root: Path, pattern: str) -> dict[str, dict[int, str]]:
+    """Sequence -> frame number -> the digits as they are written in the file name, all sorted; may be empty.
 
     Args:
       root: the dump's folder.
-      pattern: path below it; without ``{sequence}`` there is one, named "".
+      pattern: path below it; without ``{sequence}`` there is one, named "". Without ``{frame}`` no frame is listed.
 
     Raises:
-      ValueError: nothing matches, or two files are the same frame.
+      ValueError: two files are the same frame.
     """
     regex, found = _regex(pattern), {}
-    for path in root.glob(fill(glob.escape(pattern), "*", "*")):
-        match = regex.fullmatch(path.relative_to(root).as_posix())
+    for path in _like(root, pattern):
+        match = regex.fullmatch(path.as_posix())
         if match is None:
             continue
-        sequence, digits = match.groupdict().get("sequence", ""), match["frame"]
-        frames = found.setdefault(sequence, {})
+        frames = found.setdefault(match.groupdict().get("sequence", ""), {})
+        digits = match.groupdict().get("frame")
+        if digits is None:
+            continue
         if int(digits) in frames:
-            raise ValueError(f"{path}: frame {int(digits)} is there twice, also as {frames[int(digits)]}.")
+            raise ValueError(f"{root / path}: frame {int(digits)} is there twice, also as {frames[int(digits)]}.")
         frames[int(digits)] = digits
+    return {sequence: dict(sorted(frames.items())) for sequence, frames in sorted(found.items())}
+
+
+def find_frames(root: Path, pattern: str) -> dict[str, dict[int, str]]:
+    """``index_frames``, or a ValueError if nothing matches."""
+    found = index_frames(root, pattern)
     if not found:
         there = sorted(p.relative_to(root).as_posix() for p in root.glob("*"))[:5] if root.is_dir() else []
         raise ValueError(
             f"{root}: expected files named {pattern}, found none (there is {', '.join(there) or 'nothing'}). "
             "Is this the right folder? Another naming: give a recipe with [files] (docs/guides/importing.md)."
         )
-    return {sequence: dict(sorted(frames.items())) for sequence, frames in sorted(found.items())}
+    return found
+
+
+def unlisted(root: Path, patterns: Iterable[str]) -> list[str]:
+    """Files like those of the patterns (same folder and ending) that none of them takes: other names and numbers."""
+    patterns = list(dict.fromkeys(patterns))
+    taken = [_regex(pattern) for pattern in patterns]
+    found = {}
+    for pattern in patterns:
+        place = PurePosixPath(pattern)
+        for path in _like(root, (place.parent / f"{{frame}}{place.suffix}").as_posix()):
+            name = path.as_posix()
+            if not any(regex.fullmatch(name) for regex in taken):
+                found[name] = None
+    return sorted(found)

@@ -2,16 +2,22 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from essjax.buffers import UNIT_RANGE
+from essjax.buffers import BUFFERS, UNIT_RANGE
 from essjax.data import exr
 from essjax.data.importing import convert
 from essjax.data.importing.facts import FrameFacts
+from essjax.data.importing.planes import read_planes
+from essjax.data.importing.primaries import to_rec709
 from essjax.data.importing.recipe import Recipe
 
+COLORS = ("color", "reference", "base_color")
+"""Images whose channels are amounts of primaries."""
+ISOLATED = 0.01
+"""Share of an image's pixels up to which bad ones are mended."""
 LARGEST_ID = 2**31 - 1
 """Ids are int32."""
 TOLERANCE, BEYOND = 1e-3, 0.05
@@ -22,35 +28,95 @@ OFF_LENGTH, ENOUGH = 0.1, 100
 """By how much half of the normals may miss unit length, if there are so many: silhouettes mix shorter ones."""
 
 
-def read_images(
-    wanted: Mapping[str, tuple[Path, tuple[str, ...]]],
-) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
-    """``[H, W, C]`` float32 images of one size, each file read once, and the header of the first file.
+class Stored(NamedTuple):
+    """Where an image is stored.
 
-    The stencil is float64, which holds every id of 32 bits.
+    Attributes:
+      path: of the file.
+      channels: names there.
+      frame: index along the first axis, of files that hold all frames; or None.
+    """
+
+    path: Path
+    channels: tuple[str, ...]
+    frame: int | None = None
+
+
+def read_images(
+    wanted: Mapping[str, Stored], packings: Mapping[str, tuple[int, int]] | None = None
+) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
+    """``[H, W, C]`` float32 images, each file read once, and the header of the first file.
+
+    Integers of 8 and 16 bits become fractions of 255 and 65535, packed ones what they stand for. Colours become Rec.
+    709 where a header states other primaries. The stencil is float64, which holds every id of 32 bits, as it is stored.
 
     Args:
-      wanted: image -> its file and channel names.
+      wanted: image -> where it is. The first one says which size the frame has; others have it, or a multiple.
+      packings: images that are packed into bytes -> D and D' of ``convert.unpack``.
 
     Raises:
       ValueError: names the file and the channel.
     """
-    by_path: dict[Path, list[str]] = {}
-    for image, (path, _) in wanted.items():
-        by_path.setdefault(path, []).append(image)
+    by_file: dict[tuple[Path, int | None], list[str]] = {}
+    for image, (path, _, frame) in wanted.items():
+        by_file.setdefault((path, frame), []).append(image)
     images, headers, size = {}, [], None
-    for path, names in by_path.items():
-        planes, header = exr.read_all(path, [channel for name in names for channel in wanted[name][1]])
+    for (path, frame), names in by_file.items():
+        planes, header = read_planes(path, [channel for name in names for channel in wanted[name].channels], frame)
         headers.append(header)
+        matrix = to_rec709(header, str(path))
         for name in names:
-            for channel in wanted[name][1]:
-                size = planes[channel].shape if size is None else size
-                if planes[channel].shape != size:
-                    (high, wide), (h, w) = size, planes[channel].shape
-                    raise ValueError(f"{path}, channel {channel}: expected {wide}x{high} as the others, got {w}x{h}.")
-            dtype = np.float64 if name == "stencil" else np.float32
-            images[name] = _stacked([planes[channel] for channel in wanted[name][1]], dtype)
+            mine = [planes[channel] for channel in wanted[name].channels]
+            size = mine[0].shape if size is None else size
+            for channel, plane in zip(wanted[name].channels, mine, strict=True):
+                _check_size(path, channel, plane.shape, size, mine[0].shape)
+            images[name] = _values(path, name, mine, (packings or {}).get(name))
+            if matrix is not None and name in COLORS:
+                images[name] = np.ascontiguousarray(images[name]) @ matrix.T
     return {name: images[name] for name in wanted}, headers[0]
+
+
+def _check_size(path: Path, channel: str, got: tuple[int, ...], size: tuple[int, ...], own: tuple[int, ...]) -> None:
+    (height, width), (high, wide) = size, got
+    if got != own or high % height or wide % width or high // height != wide // width:
+        raise ValueError(
+            f"{path}, channel {channel}: expected {width}x{height} as the others (or a whole multiple), got "
+            f"{wide}x{high}."
+        )
+
+
+def _values(path: Path, name: str, planes: list[np.ndarray], packing: tuple[int, int] | None) -> np.ndarray:
+    """``[H, W, C]`` of what planes stand for, see ``read_images``."""
+    if packing is not None:
+        if planes[0].dtype != np.uint8:
+            raise ValueError(
+                f"{path}: [{name}] packing: expected bytes, the file holds {planes[0].dtype}. Leave it out."
+            )
+        return convert.unpack(np.stack(planes, axis=-1), BUFFERS[name].channels, *packing)
+    if name == "stencil":
+        return _stacked(planes, np.float64)
+    image = _stacked(planes, np.float32)
+    full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(planes[0].dtype)
+    return image if full is None else image / np.float32(full)
+
+
+def repair(name: str, image: np.ndarray) -> int:
+    """Set single NaN and infinite pixels to the median of their neighbours, in place; returns how many.
+
+    Depth may be +inf. An image of which more than ``ISOLATED`` is bad is left as it is: that is no firefly.
+    """
+    bad = np.isnan(image) if name == "depth" else ~np.isfinite(image)
+    bad = bad.any(axis=-1)
+    if not bad.any() or bad.mean() > ISOLATED:
+        return 0
+    mended = 0
+    for row, column in np.argwhere(bad):
+        window = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        good = image[window][~bad[window]]
+        if len(good):
+            image[row, column] = np.median(good, axis=0)
+            mended += 1
+    return mended
 
 
 def _stacked(planes: list[np.ndarray], dtype: type[np.floating]) -> np.ndarray:
@@ -122,6 +188,8 @@ def buffer(name: str, stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> tu
       ValueError: more than a few are outside, or the normals are not of unit length (names the recipe's key), or an id
         is too large.
     """
+    if name == "reactive":
+        stored = _reactive(stored, recipe.reactive.kind)
     if name in UNIT_RANGE:
         return _unit_range(name, stored, np.ones_like(hit) if name == "reactive" else hit, recipe)
     if name == "stencil":
@@ -155,8 +223,21 @@ def _unit_range(name: str, stored: np.ndarray, hit: np.ndarray, recipe: Recipe) 
     return np.where(hit, image, np.float32(0.0)), outside
 
 
+def _reactive(stored: np.ndarray, kind: str) -> np.ndarray:
+    if kind == "radiance":
+        return (stored.max(axis=-1, keepdims=True) > 0).astype(np.float32)
+    return 1 - stored if kind == "transmittance" else stored
+
+
 def _check_normals(stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> None:
     encoding = recipe.normal.encoding
+    unknown = np.isnan(stored).any(axis=-1) & hit[..., 0]
+    if unknown.any():
+        raise ValueError(
+            f"normal ({', '.join(recipe.channels['normal'])}): expected vectors, got NaN in "
+            f"{np.count_nonzero(unknown)} pixels of surfaces. Write zero vectors where there is none; --repair mends "
+            "single pixels."
+        )
     vectors = (stored if encoding == "signed" else 2.0 * stored - 1.0)[hit[..., 0]]
     length = np.sqrt(np.square(vectors).sum(-1))
     there = length > convert.SHORT_NORMAL

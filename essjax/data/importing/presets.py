@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from essjax.data.importing.arm import arm_facts
+from essjax.data.importing.arm import arm_facts, gym_facts
 from essjax.data.importing.blender import open_blender
-from essjax.data.importing.dump import MakeFacts, open_dump
+from essjax.data.importing.dump import MakeFacts, open_dump, unlisted_files
 from essjax.data.importing.facts import Facts, generic_facts, no_facts
 from essjax.data.importing.files import fill
 from essjax.data.importing.recipe import Recipe, load_recipe
 from essjax.data.importing.splits import Range, fit_segments, split_segments
-from essjax.data.importing.stream import Clip, OnFrame, OpenClip, Written, open_clip, write_clip
+from essjax.data.importing.stream import Clip, OnFrame, OpenClip, Written, hint, open_clip, write_clip
 from essjax.data.importing.unreal import header_facts
 from essjax.data.layout import (
     Dataset,
@@ -33,16 +33,18 @@ class ImportReport:
       dataset: the dataset that was written.
       totals: counts over all frames: ``pixels`` (LR), ``background`` pixels, ``negative`` colour values set to 0,
         ``clamped`` values beyond half's range; ``outside`` values of buffers in [0, 1], clipped; ``mixed`` silhouette
-        pixels of static objects whose motion was taken from the cameras (blender); ``unwritten`` pixels likewise
-        (unreal); ``infinite`` colour values.
+        pixels of static objects whose motion was taken from the cameras (blender); ``unwritten`` pixels likewise;
+        ``still`` pixels of a background without motion of its own; ``infinite`` colour values; ``repaired`` pixels.
       skipped: sequence -> broken frame -> what is wrong with it, or first frame of a gap -> which frames are missing.
       imported: the sequences of this import; the dataset may hold others, imported before.
+      warnings: what a user should look at.
     """
 
     dataset: Dataset
     totals: Mapping[str, int]
     skipped: Mapping[str, Mapping[int, str]]
     imported: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def sequence(self) -> SequenceInfo:
@@ -63,6 +65,7 @@ class Dump(NamedTuple):
       recipe: a TOML that changes keys of the preset's, or None.
       reference: folder of the references, or None.
       skip_broken: whether broken and missing frames are left out.
+      repair: whether single NaN and infinite pixels are mended.
       workers: threads; None: one per core.
     """
 
@@ -70,21 +73,24 @@ class Dump(NamedTuple):
     recipe: Path | None
     reference: Path | None
     skip_broken: bool
+    repair: bool
     workers: int | None
 
 
-Preset = Callable[[Dump], Sequence[Clip]]
-"""Opens a dump; a ValueError names the file and what is missing or wrong."""
+Preset = Callable[[Dump], tuple[Sequence[Clip], list[str]]]
+"""Opens a dump: its clips, and what a user should know; a ValueError names the file and what is missing or wrong."""
 
 
-def _blender(dump: Dump) -> Sequence[Clip]:
+def _blender(dump: Dump) -> tuple[Sequence[Clip], list[str]]:
+    if dump.repair:
+        raise ValueError("the preset blender does not mend pixels: leave --repair out.")
     if dump.recipe is not None or dump.reference is not None:
         raise ValueError("the preset blender takes neither a recipe nor a reference folder: meta.json says it all.")
-    return [open_blender(dump.source, workers=dump.workers, skip_broken=dump.skip_broken)]
+    return [open_blender(dump.source, workers=dump.workers, skip_broken=dump.skip_broken)], []
 
 
 def _by_recipe(name: str, facts_of: Callable[[Path, Recipe, str, int, int], Facts]) -> Preset:
-    def open_(dump: Dump) -> Sequence[Clip]:
+    def open_(dump: Dump) -> tuple[Sequence[Clip], list[str]]:
         def facts(sequence: str, recipe: Recipe, width: int, height: int) -> Facts:
             return facts_of(dump.source, recipe, sequence, width, height)
 
@@ -93,9 +99,9 @@ def _by_recipe(name: str, facts_of: Callable[[Path, Recipe, str, int, int], Fact
     return open_
 
 
-def _open_by_recipe(name: str, dump: Dump, facts: MakeFacts) -> Sequence[Clip]:
+def _open_by_recipe(name: str, dump: Dump, facts: MakeFacts) -> tuple[Sequence[Clip], list[str]]:
     source, reference = dump.source, dump.reference
-    clips = open_dump(source, load_recipe(name, dump.recipe), reference, facts, name)
+    clips = open_dump(source, load_recipe(name, dump.recipe), reference, facts, name, repair=dump.repair)
     missing = [path for clip in clips for path in clip.missing()]
     if missing and not dump.skip_broken:
         raise ValueError(
@@ -105,7 +111,12 @@ def _open_by_recipe(name: str, dump: Dump, facts: MakeFacts) -> Sequence[Clip]:
     folders = {"folder": str(source.resolve())}
     if reference is not None:
         folders["reference_folder"] = str(reference.resolve())
-    return [dataclasses.replace(clip, source={**clip.source, **folders}) for clip in clips]
+    if dump.repair:
+        folders["repair"] = "single pixels"
+    others = unlisted_files(clips)
+    shown = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
+    warnings = [f"not imported, because no pattern takes their names: {shown}"] if others else []
+    return [dataclasses.replace(clip, source={**clip.source, **folders}) for clip in clips], warnings
 
 
 def _metadata(read: Callable[[Path, int, int], Facts], otherwise: Callable[[int, int], Facts]) -> Any:
@@ -132,6 +143,8 @@ PRESETS: Mapping[str, Preset] = {
     "unreal": _by_recipe("unreal", _metadata(generic_facts, _from_header)),
     "extranet": _by_recipe("extranet", _metadata(generic_facts, _nothing)),
     "arm-nss": _by_recipe("arm-nss", _metadata(arm_facts, _nothing)),
+    "arm-gym": _by_recipe("arm-gym", _metadata(gym_facts, _nothing)),
+    "stssnet": _by_recipe("stssnet", _metadata(generic_facts, _nothing)),
     "generic": _by_recipe("generic", _metadata(generic_facts, _nothing)),
 }
 """Producers whose conventions are known, by name."""
@@ -147,6 +160,7 @@ def import_dataset(
     splits: Mapping[str, Range] | None = None,
     name: str | None = None,
     skip_broken: bool = False,
+    repair: bool = False,
     workers: int | None = None,
     on_frame: OnFrame = lambda done, total: None,
 ) -> ImportReport:
@@ -164,6 +178,7 @@ def import_dataset(
       splits: split -> frames or sequences, see ``splits.split_segments``.
       name: of the sequence, where there is one; None: as in the file names, or the folder's.
       skip_broken: leave broken frames out, with a cut behind them, instead of stopping.
+      repair: mend single NaN and infinite pixels from their neighbours, and count them.
       workers: threads; None: one per core.
       on_frame: called with (frames done, frames in all).
 
@@ -174,7 +189,7 @@ def import_dataset(
     if preset not in PRESETS:
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}.")
     recipe, reference = (None if path is None else Path(path) for path in (recipe, reference))
-    clips = PRESETS[preset](Dump(Path(source), recipe, reference, skip_broken, workers))
+    clips, warnings = PRESETS[preset](Dump(Path(source), recipe, reference, skip_broken, repair, workers))
     if name is not None:
         if len(clips) > 1:
             raise ValueError(f"name: the dump has {len(clips)} sequences, which keep their names. Leave it out.")
@@ -195,7 +210,9 @@ def import_dataset(
         "splits": None if splits is None else {split: list(chosen) for split, chosen in splits.items()},
     }
     dataset = write_dataset(out, fit_segments(segments, numbers), source=about)
-    return ImportReport(dataset, _totals([part.info for part in written.values()]), skipped, tuple(written))
+    totals = _totals([part.info for part in written.values()])
+    warnings += _still(totals)
+    return ImportReport(dataset, totals, skipped, tuple(written), tuple(warnings))
 
 
 def _gaps(name: str, numbers: Sequence[int], skip_broken: bool) -> dict[int, str]:
@@ -270,7 +287,7 @@ def _first_frame(opened: OpenClip, skip_broken: bool) -> SequenceInfo:
         except ValueError as error:
             reasons.append(f"sequence {clip.name}, frame {number}: {error}")
             if not skip_broken:
-                raise ValueError(f"{reasons[0]} (--skip-broken leaves such frames out.)") from error
+                raise ValueError(f"{reasons[0]}{hint(opened, number)}") from error
     raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {reasons[0]}")
 
 
@@ -283,6 +300,17 @@ def _write(opened: Sequence[OpenClip], skip_broken: bool, workers: int | None, o
         on_frame(done, total)
 
     return {one.clip.name: write_clip(one, skip_broken=skip_broken, workers=workers, on_frames=step) for one in opened}
+
+
+def _still(totals: Mapping[str, int]) -> list[str]:
+    """A warning about background that does not move with the cameras, as far as it is known."""
+    if not totals.get("still"):
+        return []
+    return [
+        f"{totals['still'] / totals['background']:.0%} of the background (sky) holds no motion although surfaces move: "
+        "nobody wrote any there. Give the cameras ([files] metadata), and it follows from them; a method takes it for "
+        "standing still otherwise"
+    ]
 
 
 def _totals(infos: Sequence[SequenceInfo]) -> dict[str, int]:

@@ -1,7 +1,7 @@
 """A recipe says what a dump's files, channels and conventions are: a small TOML, read and checked here.
 
 The presets are recipes too (``recipes/*.toml``); a user's recipe may change single keys of one. Every table of the
-TOML is one dataclass below; docs/guides/importing.md shows a complete one.
+TOML is one dataclass of ``rules``.
 """
 
 import dataclasses
@@ -13,142 +13,26 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from essjax.buffers import BUFFERS
+from essjax.data.importing.planes import STACKS
+from essjax.data.importing.rules import (
+    BaseColorRule,
+    ColorRule,
+    DepthRule,
+    JitterRule,
+    MotionRule,
+    NormalRule,
+    ReactiveRule,
+    ScaleRule,
+    WorldRule,
+)
 
 RECIPES = Path(__file__).parent / "recipes"
 REQUIRED = ("color", "depth", "motion")
 """Images without which there is no dataset."""
-IMAGES = tuple(BUFFERS)
-
-
-def _choice(*values: str, default: str | None = None) -> Any:
-    given: Any = {} if default is None else {"default": default}
-    return dataclasses.field(metadata={"choices": values}, **given)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MotionRule:
-    """``[motion]``: ``channels.motion`` names x first.
-
-    Attributes:
-      sign: which difference of positions is stored.
-      y: where a positive y points.
-      unit: "uv" is of the image's size, "ndc" of half of it.
-      x: where a positive x points.
-      scale: what the stored values are multiplied with first.
-      resolution: (width, height) of the image whose pixels the unit "pixels" means; None: its own.
-      encoding: "plain": none. "unreal4", "unreal5": the velocity texture of that engine, the second with a square root;
-        pixels it left out move with the cameras. "unreal-mrq": Movie Render Queue's MotionVectors pass.
-      jittered: the difference of the two frames' jitter is in it, and is taken out.
-      dilated: each pixel holds its nearest neighbour's motion. It cannot be undone; it is recorded.
-    """
-
-    sign: str = _choice("previous-current", "current-previous")
-    y: str = _choice("down", "up")
-    unit: str = _choice("pixels", "uv", "ndc")
-    x: str = _choice("right", "left", default="right")
-    scale: float = 1.0
-    resolution: tuple[int, int] | None = None
-    encoding: str = _choice("plain", "unreal4", "unreal5", "unreal-mrq", default="plain")
-    jittered: bool = False
-    dilated: bool = False
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DepthRule:
-    """``[depth]``.
-
-    Attributes:
-      kind: "linear": view-space z; "distance": along the pixel's ray; "reversed": near plane 1, far plane 0; "forward":
-        near plane 0, far plane 1; "metadata": one of the last two, as the metadata says.
-      near: near plane of the last two, in the dump's unit; the metadata's, if it has one, goes first.
-      far: far plane; infinite by default.
-      scale: metres per unit of the dump; negative where z is negative in front of the camera.
-      background: metres from which on it is background (sky); it becomes +inf. So does 65504, where half ends, of the
-        first two kinds.
-      zero_is_background: of the first two kinds, 0 is background too.
-    """
-
-    kind: str = _choice("linear", "distance", "reversed", "forward", "metadata")
-    near: float | None = None
-    far: float = float("inf")
-    scale: float = 1.0
-    background: float = float("inf")
-    zero_is_background: bool = False
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class JitterRule:
-    """``[jitter]``.
-
-    Attributes:
-      source: "none"; "metadata": per frame; "halton": Halton (2, 3), ``first`` the element of the frame numbered 0,
-        starting again after ``length`` frames.
-      sign: "sample": the samples lie at pixel centre + jitter; "image": the image was shifted by it.
-      y: where a positive y points.
-      unit: as of motion.
-      first: see source.
-      length: see source.
-    """
-
-    source: str = _choice("none", "metadata", "halton", default="none")
-    sign: str = _choice("sample", "image", default="sample")
-    y: str = _choice("down", "up", default="down")
-    unit: str = _choice("pixels", "uv", "ndc", default="pixels")
-    first: int = 1
-    length: int = 8
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ColorRule:
-    """``[color]``, for colour and reference.
-
-    Attributes:
-      encoding: the transfer curve.
-      pre_exposed: colour was multiplied with the metadata's exposure, and is divided by it.
-    """
-
-    encoding: str = _choice("linear", "srgb", default="linear")
-    pre_exposed: bool = False
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class NormalRule:
-    """``[normal]``: ``encoding`` "signed", in [-1, 1], or "unsigned", in [0, 1]."""
-
-    encoding: str = _choice("signed", "unsigned", default="signed")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BaseColorRule:
-    """``[base_color]``: ``encoding``, the transfer curve."""
-
-    encoding: str = _choice("linear", "srgb", default="linear")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ScaleRule:
-    """``[scale]``: what stored values are multiplied with first, by image; ``color`` is also that of the reference."""
-
-    color: float = 1.0
-    base_color: float = 1.0
-    roughness: float = 1.0
-    metallic: float = 1.0
-    specular: float = 1.0
-    n_dot_v: float = 1.0
-    reactive: float = 1.0
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WorldRule:
-    """``[world]``, for normals and positions.
-
-    Attributes:
-      scale: metres per unit of the dump.
-      handedness: of the dump's world; y is negated where it is "left". Cameras are given right-handed.
-    """
-
-    scale: float = 1.0
-    handedness: str = _choice("right", "left", default="right")
+IMAGES = (*BUFFERS, "written")
+"""What a recipe may name files and channels of, "reference" aside; "written" is a mask, see ``MotionRule``."""
+PACKED = ("motion", "depth")
+"""Images that may be packed into bytes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -173,6 +57,17 @@ class Recipe:
     base_color: BaseColorRule = BaseColorRule()
     scale: ScaleRule = ScaleRule()
     world: WorldRule = WorldRule()
+    reactive: ReactiveRule = ReactiveRule()
+
+    @property
+    def packings(self) -> dict[str, tuple[int, int]]:
+        """Images that are packed into bytes -> D and D' of ``convert.unpack``."""
+        found = {"motion": self.motion.packing, "depth": self.depth.packing}
+        return {image: packing for image, packing in found.items() if packing is not None}
+
+    def stacked(self, image: str) -> bool:
+        """Whether one file holds all frames of an image."""
+        return "{frame}" not in self.pattern(image)
 
     def pattern(self, image: str) -> str:
         """Where an image is; a reference without an entry is named as colour is."""
@@ -193,7 +88,7 @@ class Recipe:
 POSITIVE = ("near", "far", "background", *(field.name for field in dataclasses.fields(ScaleRule)))
 _TABLES = {
     "motion": MotionRule, "depth": DepthRule, "jitter": JitterRule, "color": ColorRule, "normal": NormalRule,
-    "base_color": BaseColorRule, "scale": ScaleRule, "world": WorldRule,
+    "base_color": BaseColorRule, "scale": ScaleRule, "world": WorldRule, "reactive": ReactiveRule,
 }  # fmt: skip
 
 
@@ -206,6 +101,10 @@ def _value(where: str, field: dataclasses.Field, value: Any) -> Any:
     if field.name == "resolution":
         if not (isinstance(value, list) and len(value) == 2 and all(type(v) is int and v > 0 for v in value)):
             raise ValueError(f"{where}: expected [width, height] in pixels, got {value!r}.")
+        return tuple(value)
+    if field.name == "packing":
+        if not (isinstance(value, list) and len(value) == 2 and all(v in (255, 256) for v in value)):
+            raise ValueError(f"{where}: expected [D, D'], each 255 or 256: (high + low / D) / D', got {value!r}.")
         return tuple(value)
     expected = bool if field.type is bool else int if field.type is int else float
     if isinstance(value, bool) != (expected is bool) or not isinstance(value, (int, float)):
@@ -260,8 +159,12 @@ def _strings(where: str, content: Any, keys: tuple[str, ...]) -> Mapping[str, An
 def _files(where: str, content: Any) -> dict[str, str]:
     files = dict(_strings(where, content, ("frame", *IMAGES, "reference", "metadata")))
     for key, pattern in files.items():
-        if not isinstance(pattern, str) or (key != "metadata" and "{frame}" not in pattern):
-            raise ValueError(f"{where} {key}: expected a path with {{frame}} in it, got {pattern!r}.")
+        whole = isinstance(pattern, str) and (key == "metadata" or pattern.endswith(STACKS))
+        if not isinstance(pattern, str) or ("{frame}" not in pattern and not whole):
+            raise ValueError(
+                f"{where} {key}: expected a path with {{frame}} in it, got {pattern!r}. Only {', '.join(STACKS)} may "
+                "hold all frames."
+            )
         if PurePath(pattern).is_absolute() or not pattern:
             raise ValueError(f"{where} {key}: expected a path below the dump's folder, got {pattern!r}.")
     if "frame" not in files and "color" not in files:
@@ -269,11 +172,21 @@ def _files(where: str, content: Any) -> dict[str, str]:
     return files
 
 
-def _channels(where: str, content: Any) -> dict[str, tuple[str, ...]]:
+def _counts(image: str, content: Mapping[str, Any]) -> tuple[int, ...]:
+    """How many channels of an image a recipe may name."""
+    if image in PACKED and isinstance(content.get(image), dict) and "packing" in content[image]:
+        return tuple(bytes_ * BUFFERS[image].channels for bytes_ in (2, 3, 4))
+    if image == "reactive" and isinstance(content.get(image), dict) and content[image].get("kind") == "radiance":
+        return (3,)
+    return (1,) if image == "written" else (3,) if image == "reference" else (BUFFERS[image].channels,)
+
+
+def _channels(where: str, content: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     channels = {}
-    for image, names in _strings(where, content, (*IMAGES, "reference")).items():
-        count = 3 if image == "reference" else BUFFERS[image].channels
-        if not (isinstance(names, list) and len(names) == count and all(isinstance(n, str) for n in names)):
+    for image, names in _strings(where, content.get("channels"), (*IMAGES, "reference")).items():
+        counts = _counts(image, content)
+        if not (isinstance(names, list) and len(names) in counts and all(isinstance(n, str) for n in names)):
+            count = " or ".join(map(str, counts))
             raise ValueError(f"{where} {image}: expected a list of {count} channel names, got {names!r}.")
         channels[image] = tuple(names)
     missing = [image for image in REQUIRED if image not in channels]
@@ -293,7 +206,7 @@ def make_recipe(content: Mapping[str, Any], where: str) -> Recipe:
     unknown = [key for key in content if key not in known]
     if unknown:
         raise ValueError(f"{where}: there is no table {unknown[0]!r}; there are {', '.join(sorted(known))}.")
-    channels = _channels(f"{where}: [channels]", content.get("channels"))
+    channels = _channels(f"{where}: [channels]", content)
     optional = content.get("optional", [])
     names = [image for image in channels if image not in REQUIRED]
     if not isinstance(optional, list) or any(image not in names for image in optional):
@@ -316,6 +229,8 @@ def _check(recipe: Recipe, where: str) -> None:
     wants_metadata = recipe.jitter.source == "metadata" or recipe.color.pre_exposed
     if wants_metadata and "metadata" not in recipe.files:
         raise ValueError(f"{where}: [files] metadata: missing. jitter.source or color.pre_exposed ask for it.")
+    if recipe.stacked("color") and any(not recipe.stacked(image) for image in recipe.channels):
+        raise ValueError(f"{where}: [files]: color holds all frames in one file, so every image must. Split them.")
     motion, depth = recipe.motion, recipe.depth
     if motion.resolution is not None and motion.unit != "pixels":
         raise ValueError(f"{where}: [motion] resolution: only for the unit pixels, got {motion.unit}. Leave it out.")
@@ -338,7 +253,7 @@ def _merge(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
         raise ValueError(f"{path}: expected a recipe in TOML, cannot read it ({error}).") from error
 

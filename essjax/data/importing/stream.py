@@ -17,6 +17,8 @@ from essjax.frames import Frame
 
 SAVE_EVERY = 16
 """Frames between two writes of ``sequence.json``: what a killed import loses at most."""
+SKIP = " (--skip-broken leaves such frames out.)"
+"""A hint."""
 OnFrame = Callable[[int, int], Any]
 """Called with (frames done, frames in all)."""
 
@@ -172,8 +174,7 @@ def write_clip(
                 _commit(writer, number, future, save=index % SAVE_EVERY == 0)
             except BrokenFrame as error:
                 if not skip_broken:
-                    message = f"sequence {clip.name}, frame {number}: {error} (--skip-broken leaves such frames out.)"
-                    raise ValueError(message) from error
+                    raise ValueError(f"sequence {clip.name}, frame {number}: {error}{hint(opened, number)}") from error
                 writer.skip(number, str(error), error.made_from)
             on_frames(1)
     skipped = {number: writer.skipped[number]["reason"] for number in sorted(writer.skipped)}
@@ -186,6 +187,22 @@ def write_clip(
             f"replace the wrong ones, delete {writer.folder}, and import again."
         )
     return Written(writer.finish(), skipped)
+
+
+def hint(opened: OpenClip, broken: int) -> str:
+    """What helps against a broken frame: leaving it out does not where all frames share its defect."""
+    clip, writer, pending = opened
+    others = [number for number in pending if number > broken]
+    if writer.info is not None or not others:
+        return SKIP
+    for number in (others[0], others[-1]):
+        try:
+            frame = clip.convert(number)
+            writer.describe(number, frame.frame, frame.reference)
+            return SKIP
+        except ValueError:
+            continue
+    return " (So are other frames: change the recipe or the dump.)"
 
 
 def _commit(writer: SequenceWriter, number: int, future: Future[PreparedFrame], *, save: bool) -> None:

@@ -253,7 +253,8 @@ def test_a_gap_in_the_numbers_is_a_cut(tmp_path):
 def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
     run = lambda: import_dataset(dump, tmp_path / "out", "blender")
     with pytest.raises(
-        ValueError, match="preset: expected one of blender, unreal, extranet, arm-nss, generic, got 'maya'"
+        ValueError,
+        match="preset: expected one of blender, unreal, extranet, arm-nss, arm-gym, stssnet, generic, got 'maya'",
     ):
         import_dataset(dump, tmp_path / "out", "maya")
     (dump / "hr.0010.exr").rename(dump / "gone.exr")

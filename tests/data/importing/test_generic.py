@@ -163,7 +163,10 @@ first = 2
             r"my\.toml: \[motion\] sign: expected one of previous-current, current-previous,",
         ),
         ('motion = {y = "up", unit = "uv"}', r"\[motion\] sign: missing\. Say which it is, nothing is assumed"),
-        ("motion.flip = true", r"\[motion\]: there is no key 'flip'; the keys are sign, y, unit, x, scale, resolution"),
+        (
+            "motion.flip = true",
+            r"\[motion\]: there is no key 'flip'; the keys are sign, y, unit, x, zero, scale",
+        ),
         ('motion.scale = "2"', r"\[motion\] scale: expected a number, got '2'"),
         ("motion.resolution = [96]", r"\[motion\] resolution: expected \[width, height\] in pixels, got \[96\]"),
         ("motion.dilated = 1", r"\[motion\] dilated: expected a true or false, got 1"),
@@ -279,7 +282,7 @@ def test_presets_and_the_examples_of_the_guide_load(tmp_path):
     guide = Path(__file__).parents[3] / "docs" / "guides" / "importing.md"
     blocks = [block.split("```")[0] for block in guide.read_text().split("```toml\n")[1:]]
     complete = [block for block in blocks if "[files]" in block]
-    assert len(complete) == 1
+    assert len(complete) == 2 and make_recipe(tomllib.loads(complete[1]), "guide").packings
     recipe = make_recipe(tomllib.loads(complete[0]), "guide")
     assert set(recipe.channels) >= {"color", "depth", "motion", "base_color", "normal"}
     for rule in (
@@ -291,6 +294,7 @@ def test_presets_and_the_examples_of_the_guide_load(tmp_path):
         recipe.base_color,
         recipe.scale,
         recipe.world,
+        recipe.reactive,
     ):
         for field in dataclasses.fields(rule):
             assert f"{field.name} = " in complete[0], f"the guide does not show {field.name}"

@@ -9,7 +9,7 @@ import pytest
 
 from essjax.data import import_dataset
 from essjax.data.importing.facts import FrameFacts, generic_facts
-from essjax.data.importing.images import buffer, radiance, read_images, view_depth
+from essjax.data.importing.images import Stored, buffer, radiance, read_images, view_depth
 from essjax.data.importing.recipe import ScaleRule, make_recipe
 from tests.data.importing.dumps import OUR_RULES, H, W, imported, rgb, truth, write
 
@@ -166,7 +166,7 @@ def test_ids_of_32_bits_keep_apart(tmp_path):
     """float32 would merge the first two."""
     ids = np.uint32([[16777216, 16777217, 2**31 - 1]])
     OpenEXR.File({}, {"id": ids}).write(str(tmp_path / "a.exr"))
-    stored = read_images({"stencil": (tmp_path / "a.exr", ("id",))})[0]["stencil"]
+    stored = read_images({"stencil": Stored(tmp_path / "a.exr", ("id",))})[0]["stencil"]
     image, _ = buffer("stencil", stored, np.ones((1, 3, 1), bool), recipe())
     np.testing.assert_array_equal(image[..., 0], ids)
     for bad in (3e9, np.inf, np.nan):

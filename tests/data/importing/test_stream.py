@@ -152,7 +152,8 @@ def test_broken_and_missing_files_are_named(tmp_path):
     assert report.sequence.numbers == (1, 3)
     write_extranet(tmp_path / "dump", truth(T=3, W=20), leave_out=("BaseColor",))  # all but one in another size
     with pytest.raises(
-        ValueError, match=r"frame 1: .*BaseColor\.0001\.exr, channel R: expected 20x14 as the others, got 24"
+        ValueError,
+        match=r"frame 1: .*BaseColor\.0001\.exr, channel R: expected 20x14 as the others \(or a whole multiple\), got",
     ):
         run("c")
 
