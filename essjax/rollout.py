@@ -1,6 +1,7 @@
 """Unroll a method over a sequence: one ``lax.scan``, the same for training, evaluation and benchmarks."""
 
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -61,15 +62,15 @@ class Rollout:
     state: dict[str, PyTree]
 
 
-def check_supported(method: Method, frames: Frame, schedule: Schedule) -> None:
-    """Raise a ValueError where a method lacks a buffer or cannot do a kind of frame that the schedule asks for.
+def check_supported(method: Method, frames: Frame, kinds: Iterable[str]) -> None:
+    """Raise a ValueError where a method lacks a buffer or cannot do one of ``kinds``.
 
-    Frames must be float32 (16 bits belong to the networks, see ``stream_step``), with the same leading axes everywhere.
+    Frames must be float32 (16 bits belong to the networks, see ``stream``), with the same leading axes everywhere.
     """
     check_shapes(frames, "frames")
     check_dtypes(frames, "frames")
-    require(frames, ("color", *sorted(method.info.requires)), method.info.name)
-    if method.info.renders_all and ESS in schedule.kinds(frames.motion.shape[0]):
+    require(frames, (*(("color",) if SS in kinds else ()), *sorted(method.info.requires)), method.info.name)
+    if method.info.renders_all and ESS in kinds:
         raise ValueError(
             f"{method.info.name} cannot extrapolate: it needs the colour of every frame. Use schedule every()."
         )
@@ -106,9 +107,9 @@ def unroll(
     Raises:
       ValueError: a buffer is missing, or the schedule extrapolates and the method cannot.
     """
-    check_supported(method, frames, schedule)
     length = frames.motion.shape[0]
     kinds = schedule.kinds(length)
+    check_supported(method, frames, kinds)
     pairs = max((length - schedule.lead) // schedule.period, 0)
     body_end = schedule.lead + pairs * schedule.period
     history = method.start(select_time(frames, 0)) if history is None else history
@@ -235,19 +236,53 @@ def bake(method: Method, variables: PyTree) -> Method:
     return Method(no_variables, method.start, render_step, extrapolate_step, method.info)
 
 
-def stream_step(method: Method, kind: str, *, dtype: str = "float32", compiler_options: dict | None = None) -> Callable:
-    """One jitted step for streaming, history donated: ``(variables, history, frame) -> (history, image)``.
+def stream(
+    method: Method,
+    variables: PyTree,
+    frames: Iterable[Frame],
+    kinds: Iterable[str],
+    *,
+    dtype: str = "float32",
+    compiler_options: Mapping | None = None,
+) -> Iterator[Array]:
+    """Yield the image of each frame in turn, as an application would make them: one compiled step per kind of frame.
+
+    A later stream of the same method does not compile again. The history is donated: it stays where it is.
 
     Args:
       method: the two steps.
-      kind: ``SS`` or ``ESS``.
+      variables: from ``method.init``.
+      frames: one by one, ``[..., H, W, C]``; the colour of those that are extrapolated is not looked at.
+      kinds: ``SS`` or ``ESS`` for each frame, as ``schedule.kinds(length)`` or ``itertools.cycle((SS, ESS))`` says.
       dtype: the networks' compute type, "float32", "bfloat16" or "float16"; inputs and outputs stay float32.
       compiler_options: for ``jax.jit``.
-    """
 
+    Yields:
+      ``[..., h, w, 3]``, not waited for. Step n's is frame ``n - method.info.latency``'s.
+
+    Raises:
+      ValueError: a buffer is missing, or a frame is extrapolated and the method cannot.
+    """
+    history = None
+    for frame, kind in zip(frames, kinds):  # noqa: B905  the kinds may go on for ever
+        if history is None:
+            check_supported(method, frame, (kind,))
+            history = jax.jit(method.start)(frame)
+        step = stream_step(method, kind, dtype=dtype, compiler_options=compiler_options)
+        history, image = step(variables, history, frame if kind == SS else without_color(frame))
+        yield image
+
+
+def stream_step(method: Method, kind: str, *, dtype: str = "float32", compiler_options: Mapping | None = None):
+    """Return the jitted step of ``stream``: ``(variables, history, frame) -> (history, image)``, history donated."""
+    return _stream_step(method, kind, dtype, tuple((compiler_options or {}).items()))
+
+
+@lru_cache(maxsize=128)
+def _stream_step(method: Method, kind: str, dtype: str, compiler_options: tuple) -> Callable:
     def step(variables, history, frame):
         with compute_dtype(dtype):
             history, prediction = _step(method, variables, history, frame, kind, train=False)
         return history, prediction.image
 
-    return jax.jit(step, donate_argnums=1, compiler_options=compiler_options)
+    return jax.jit(step, donate_argnums=1, compiler_options=dict(compiler_options))

@@ -4,7 +4,7 @@ import collections.abc
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,10 +17,10 @@ from essjax.color import display, expose
 from essjax.data import Dataset, Segment, read_segment
 from essjax.data.memory import Kept
 from essjax.exposure import clip_exposure
-from essjax.frames import Frame, Sequence, background, rendered_color, select_time, without_color
+from essjax.frames import Frame, Sequence, background, rendered_color
 from essjax.interfaces import Method, expand_flag
 from essjax.metrics import PHASES, aggregate, has_source, mean_over, psnr, score_rollout
-from essjax.rollout import ESS, SS, Schedule, alternate, check_supported, every, stream_step
+from essjax.rollout import ESS, SS, Schedule, alternate, every, stream
 from essjax.typing import Array, PyTree
 from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
 
@@ -143,30 +143,22 @@ class Runner:
     """Steps a method frame by frame, as a stream does: one compilation per kind of frame and frame size."""
 
     def __init__(self, method: Method, variables: PyTree, compiler_options: dict | None = None):
-        self.method, self.variables = method, variables
-        self._steps = {kind: stream_step(method, kind, compiler_options=compiler_options) for kind in (SS, ESS)}
-        self._start = jax.jit(method.start)
+        self.method, self.variables, self._options = method, variables, compiler_options
 
     def __call__(self, sequence: Sequence, schedule: Schedule) -> np.ndarray:
         """Images ``[T, h, w, 3]`` of one sequence; image n is frame n's whatever the latency."""
         frames = sequence.native if self.method.info.native else sequence.frames
         if frames is None:
             raise ValueError(f"{self.method.info.name} needs frames at native resolution, which this dataset lacks.")
-        check_supported(self.method, frames, schedule)
-        length = frames.motion.shape[0]
-        history, images = self._start(frame_with_batch_axis(frames, 0)), []
-        for n, kind in enumerate(schedule.kinds(length)):
-            frame = frame_with_batch_axis(frames, n)
-            frame = frame if kind == SS else without_color(frame)
-            history, image = self._steps[kind](self.variables, history, frame)
-            images.append(np.asarray(image[0]))
-        late = self.method.info.latency
+        kinds = schedule.kinds(frames.motion.shape[0])
+        streamed = stream(self.method, self.variables, batches(frames), kinds, compiler_options=self._options)
+        images, late = [np.asarray(image[0]) for image in streamed], self.method.info.latency
         return np.stack(images[late:] + images[-1:] * late)
 
 
-def frame_with_batch_axis(frames: Frame, n: int) -> Frame:
-    """Frame ``n`` of time-major frames without a batch axis, as a batch of one."""
-    return jax.tree.map(lambda leaf: leaf[None], select_time(frames, n))
+def batches(frames: Frame) -> Iterator[Frame]:
+    """Each of time-major frames without a batch axis, as a batch of one."""
+    return (jax.tree.map(lambda leaf, n=n: leaf[n, None], frames) for n in range(frames.motion.shape[0]))
 
 
 def schedules(method: Method) -> list[Schedule]:

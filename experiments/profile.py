@@ -1,14 +1,15 @@
 """``--profile``: a JAX profiler trace of the train step and of the streaming steps."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import jax
 from rich.console import Console
 
 from essjax.builtin import generate, plan
-from essjax.frames import select_time, without_color
-from essjax.rollout import ESS, SS, stream_step
+from essjax.frames import select_time
+from essjax.rollout import ESS, SS, stream
 from essjax.train import create_state, make_train_step, optimizer
 from experiments.config import Config
 from experiments.trace import describe, operations
@@ -42,18 +43,15 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
         frames = jax.tree.map(lambda leaf: leaf[:, None], disk_source(dataset, "train")[0].frames)
         variables = method.init(jax.random.key(0), select_time(frames, 0))
     kinds = (SS,) if method.info.renders_all else (SS, ESS)
-    steps = {kind: stream_step(method, kind) for kind in kinds}
-    streamed = {SS: select_time(frames, 0), ESS: without_color(select_time(frames, 1))}
-    history = method.start(streamed[SS])
-    for kind in kinds:
-        history, _ = steps[kind](variables, history, streamed[kind])
-    jax.block_until_ready(history)
+    given = itertools.cycle(select_time(frames, n) for n in range(len(kinds)))
+    images = stream(method, variables, given, itertools.cycle(kinds))
+    for _ in kinds:
+        next(images).block_until_ready()
     with jax.profiler.trace(str(folder)):
         for repetition in range(repetitions):
             for kind in kinds:
                 with jax.profiler.StepTraceAnnotation(f"stream {kind}", step_num=repetition):
-                    history, image = steps[kind](variables, history, streamed[kind])
-                    image.block_until_ready()
+                    next(images).block_until_ready()
         if stages:
             for repetition in range(repetitions):
                 with jax.profiler.StepTraceAnnotation("train", step_num=repetition):

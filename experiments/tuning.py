@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.color import display
-from essjax.frames import without_color
 from essjax.interfaces import Method
 from essjax.metrics import has_source, psnr
-from essjax.rollout import SS, check_supported
+from essjax.rollout import stream
 from essjax.typing import Array
 from experiments.config import Config
-from experiments.evaluate import Clip, frame_with_batch_axis, schedules
+from experiments.evaluate import Clip, batches, schedules
 from experiments.variants.base import Variant
 
 ALPHAS = (0.1, 0.2, 0.4, 0.7, 1.0)
@@ -76,16 +75,11 @@ def _score_grid(method: Method, grid: np.ndarray, clip: Clip) -> np.ndarray:
     variables = {"alpha": jnp.asarray(grid[:, 0]), "sigma": jnp.asarray(grid[:, 1])}
     frames = clip.sequence.native if method.info.native else clip.sequence.frames
     assert frames is not None
-    steps = _steps(method)
     totals, count = np.zeros(len(grid)), 0
     for schedule in schedules(method):
-        check_supported(method, frames, schedule)
-        history = steps["start"](variables, frame_with_batch_axis(frames, 0))
         kinds = schedule.kinds(len(clip.numbers))
         made = has_source(kinds, np.asarray(frames.cut))
-        for n, kind in enumerate(kinds):
-            frame = frame_with_batch_axis(frames, n)
-            history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
+        for n, image in enumerate(stream(_side_by_side(method, len(grid)), variables, batches(frames), kinds)):
             if n in clip.scored and made[n]:
                 totals += np.asarray(_grid_psnr(image[:, 0], clip.sequence.reference[n], clip.exposure[n]))
                 count += 1
@@ -97,23 +91,19 @@ def _grid_psnr(images: Array, target: Array, exposure: Array) -> Array:
     return jax.vmap(lambda image: psnr(display(exposure * image), display(exposure * target)))(images)
 
 
-_COMPILED: dict[Method, dict[str, Any]] = {}
+@functools.cache  # the same method again, so that it is compiled once
+def _side_by_side(method: Method, settings: int) -> Method:
+    """Run ``method`` under several settings at once: variables, history and images are ``[settings, ...]``."""
 
+    def start(example):
+        return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], settings, axis=0), method.start(example))
 
-def _steps(method: Method) -> dict[str, Any]:
-    """Both steps, mapped over settings; compiled once per method."""
-    if method not in _COMPILED:
+    def mapped(step):
+        return lambda variables, history, frame, *, train=False: jax.vmap(step, (0, 0, None))(variables, history, frame)
 
-        def mapped(step):
-            def run(variables, history, frame):
-                history, prediction = step(variables, history, frame)
-                return history, prediction.image
-
-            return jax.jit(jax.vmap(run, in_axes=(0, 0, None)))
-
-        _COMPILED[method] = {
-            "start": jax.jit(jax.vmap(lambda v, example: method.start(example), in_axes=(0, None))),
-            "ss": mapped(method.render_step),
-            "ess": mapped(method.extrapolate_step),
-        }
-    return _COMPILED[method]
+    return method._replace(
+        start=start,
+        render_step=mapped(method.render_step),
+        extrapolate_step=mapped(method.extrapolate_step),
+        parts=None,
+    )

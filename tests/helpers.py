@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.frames import Frame, GBuffers, SampleRanges, Sequence
+from essjax.frames import Frame, GBuffers, SampleRanges, Sequence, select_time
+from essjax.rollout import stream
+
+at = jax.jit(select_time)  # one program per shape of frames; by slices, each frame and leaf would be one
+
+
+def streamed(method, variables, frames: Frame, kinds, **options) -> jax.Array:
+    """Images ``[T, ...]`` of ``rollout.stream`` over frames ``[T, ...]``."""
+    each = (at(frames, n) for n in range(frames.motion.shape[0]))
+    return jnp.stack(list(stream(method, variables, each, kinds, **options)))
 
 
 def random_image(seed: int, *shape: int, low: float = 0.0, high: float = 2.0) -> jax.Array:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import re
 
 import jax
@@ -11,8 +12,8 @@ import pytest
 
 from essjax.frames import Prediction, select_time, without_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
-from essjax.rollout import ESS, SS, alternate, bake, check_supported, every, frames_of, stream_step, unroll
-from tests.helpers import make_frames
+from essjax.rollout import ESS, SS, alternate, bake, check_supported, every, frames_of, stream, stream_step, unroll
+from tests.helpers import at, make_frames, streamed
 
 
 def toy(latency: int = 0, **info) -> Method:
@@ -46,7 +47,6 @@ VARIABLES = {"mix": jnp.array(0.25)}
 TOY = toy()
 STEPS = {SS: jax.jit(TOY.render_step), ESS: jax.jit(TOY.extrapolate_step)}
 EVERY, EVEN, ODD = every(), alternate(0), alternate(1)
-at = jax.jit(select_time)  # one program per shape of frames; by slices, each frame and leaf would be one
 
 
 @functools.cache
@@ -153,9 +153,9 @@ def test_unsupported_frames_and_schedules():
         refuse_extrapolation("toy")({}, {}, frames)
     poor = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, roughness=None))
     with pytest.raises(ValueError, match="toy needs the buffers roughness, which these frames do not have"):
-        check_supported(toy(requires=frozenset({"roughness"})), poor, EVERY)
+        check_supported(toy(requires=frozenset({"roughness"})), poor, (SS,))
     with pytest.raises(ValueError, match="toy needs the buffers color"):
-        check_supported(toy(), without_color(frames), EVERY)
+        check_supported(toy(), without_color(frames), (SS,))
 
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
@@ -166,7 +166,7 @@ def test_sixteen_bit_frames_are_refused(dtype):
     with pytest.raises(ValueError, match=f"frames, color: expected float32, got {dtype}. Cast it to float32"):
         unroll(TOY, VARIABLES, short, EVEN)
     with pytest.raises(ValueError, match=f"frames, motion: expected float32, got {dtype}. Cast it to float32"):
-        check_supported(TOY, dataclasses.replace(frames, motion=frames.motion.astype(dtype)), EVEN)
+        check_supported(TOY, dataclasses.replace(frames, motion=frames.motion.astype(dtype)), (SS, ESS))
 
 
 def test_a_baked_method_needs_no_variables():
@@ -178,12 +178,32 @@ def test_a_baked_method_needs_no_variables():
 
 def test_streaming_equals_the_rollout():
     frames = make_frames(6, T=5, H=4, W=5)
-    steps = {kind: stream_step(TOY, kind) for kind in (SS, ESS)}
-    history, images = TOY.start(at(frames, 0)), []
-    for n, kind in enumerate(EVEN.kinds(5)):
-        history, image = steps[kind](VARIABLES, history, at(frames, n))
-        images.append(image)
-    np.testing.assert_allclose(jnp.stack(images), compiled(EVEN)(frames).image, rtol=1e-6)
+    images = streamed(TOY, VARIABLES, frames, itertools.cycle((SS, ESS)))
+    np.testing.assert_allclose(images, compiled(EVEN)(frames).image, rtol=1e-6)
+
+
+def test_a_stream_asks_for_a_frame_when_its_image_is_due_and_compiles_once():
+    frames, asked = make_frames(6, T=5, H=4, W=5), []
+    hidden = dataclasses.replace(frames, color=frames.color.at[1::2].set(jnp.nan))
+    given = (asked.append(n) or at(hidden, n) for n in range(5))
+    method = toy()
+    images = stream(method, VARIABLES, given, EVEN.kinds(5))
+    assert not asked
+    first = next(images)
+    assert asked == [0]
+    rest = [np.asarray(image) for image in images]
+    assert all(np.isfinite(image).all() for image in rest)
+    again = streamed(method, VARIABLES, frames, itertools.cycle((SS, ESS)))
+    np.testing.assert_allclose(again, np.stack([first, *rest]), rtol=1e-6)
+    assert {kind: stream_step(method, kind)._cache_size() for kind in (SS, ESS)} == {SS: 1, ESS: 1}
+
+
+def test_a_stream_says_what_its_first_frame_lacks():
+    frames = make_frames(0, T=2, H=4, W=5)
+    with pytest.raises(ValueError, match="toy needs the buffers color, which these frames do not have"):
+        next(stream(TOY, VARIABLES, [without_color(at(frames, 0))], (SS,)))
+    with pytest.raises(ValueError, match="toy cannot extrapolate: it needs the colour of every frame"):
+        next(stream(toy(renders_all=True), VARIABLES, [at(frames, 0)], (ESS,)))
 
 
 def test_a_rollout_goes_on_from_the_history_of_another():

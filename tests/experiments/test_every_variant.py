@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from essjax.builtin import plan
-from essjax.frames import frame_images, select_time, without_color
-from essjax.rollout import SS, alternate, every, stream_step, unroll
+from essjax.frames import frame_images, select_time
+from essjax.rollout import alternate, every, unroll
 from essjax.train import create_state, make_train_step, optimizer
 from experiments import datasets
 from experiments.ahead import batch_shapes, state_shapes
 from experiments.config import PRESETS
 from experiments.training import initial_variables, make_batches
 from experiments.variants import VARIANTS, config_of, stages_of
+from tests.helpers import streamed
 
 pytestmark = pytest.mark.skipif(
     not os.environ.get("ESSJAX_SWEEP"), reason="compiles every variant, four minutes: ESSJAX_SWEEP=1, --dist load"
@@ -92,14 +93,8 @@ def test_streaming_is_unrolling(name, dataset):
     variables = method.init(jax.random.key(3), select_time(frames, 0))
     schedule = every() if method.info.renders_all else alternate(0)
     unrolled = jax.jit(lambda v, f: unroll(method, v, f, schedule).image)(variables, frames)
-    kinds = schedule.kinds(6)
-    steps = {kind: stream_step(method, kind) for kind in dict.fromkeys(kinds)}
-    history, images = jax.jit(method.start)(select_time(frames, 0)), []
-    for n, kind in enumerate(kinds):
-        frame = select_time(frames, n)
-        history, image = steps[kind](variables, history, frame if kind == SS else without_color(frame))
-        images.append(np.asarray(image))
+    images = list(streamed(method, variables, frames, schedule.kinds(6)))
     late = method.info.latency
-    streamed = np.stack(images[late:] + images[-1:] * late)
-    assert np.ptp(streamed) > 0.01
-    np.testing.assert_allclose(streamed, unrolled, rtol=2e-4, atol=2e-4)
+    shifted = np.stack(images[late:] + images[-1:] * late)
+    assert np.ptp(shifted) > 0.01
+    np.testing.assert_allclose(shifted, unrolled, rtol=2e-4, atol=2e-4)

@@ -3,12 +3,17 @@
 import dataclasses
 import threading
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from essjax import methods
+from essjax.rollout import SS
 from experiments import tuning
 from experiments.config import PRESETS
 from experiments.variants import get_variant
+from tests.helpers import make_frames, streamed
 
 BASE = 25.0
 
@@ -52,3 +57,13 @@ def test_the_clamps_are_tried_side_by_side(monkeypatch):
     variant = dataclasses.replace(get_variant("taau"), method=lambda config, *, clamp: clamp)
     monkeypatch.setattr(tuning, "_score_grid", score)
     assert tuning.tune(variant, PRESETS["quick"], [0]).clamp == tuning.CLAMPS[0]
+
+
+def test_settings_side_by_side_are_what_each_gives_alone():
+    method = methods.taau(2)
+    frames = make_frames(2, T=3, B=1, H=6, W=8)
+    settings = [tuning.Setting("ycocg", alpha, sigma, 0.0) for alpha, sigma in ((0.2, 0.5), (0.7, 0.9))]
+    alone = [streamed(method, tuning.setting_variables(setting), frames, (SS,) * 3) for setting in settings]
+    grid = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(tuning.setting_variables, settings))
+    both = streamed(tuning._side_by_side(method, 2), grid, frames, (SS,) * 3)
+    np.testing.assert_allclose(both, jnp.stack(alone, axis=1), rtol=1e-5, atol=1e-6)

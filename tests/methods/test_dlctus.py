@@ -15,9 +15,9 @@ from essjax.frames import select_time, without_color
 from essjax.methods import dlctus
 from essjax.methods._dlctus import REPROJECTIONS, map_color, returning_clip
 from essjax.networks import dlctus_network
-from essjax.rollout import SS, alternate, every, stream_step, unroll
+from essjax.rollout import SS, alternate, every, unroll
 from essjax.warp import backward_warp, jitter_aligned_upsample, zero_upsample
-from tests.helpers import make_frames, random_image
+from tests.helpers import make_frames, random_image, streamed
 from tests.warp.test_sampling import oracle as read_oracle
 
 T, B, H, W = 4, 2, 5, 7
@@ -219,13 +219,10 @@ def test_outputs_outside_the_clamp_have_a_gradient(bias):
 
 def test_streaming_equals_the_rollout():
     frames = random_frames(1)
-    step, history, images = stream_step(METHOD, SS), METHOD.start(select_time(frames, 0)), []
-    for n in range(T):
-        history, image = step(VARIABLES, history, select_time(frames, n))
-        images.append(image)
+    images = streamed(METHOD, VARIABLES, frames, (SS,) * T)
     result = run(frames)
     assert result.image.shape == (T, B, 2 * H, 2 * W, 3) and bool(jnp.all(jnp.isfinite(result.image)))
-    np.testing.assert_allclose(reinhard(result.image), reinhard(jnp.stack(images)), atol=1e-5)
+    np.testing.assert_allclose(reinhard(result.image), reinhard(images), atol=1e-5)
 
 
 def test_first_frame_and_cut_start_from_the_aligned_frame():

@@ -227,7 +227,7 @@ def test_shapes_and_training_state(options):
     assert prediction.state == {}
     lacking = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, roughness=None))
     with pytest.raises(ValueError, match="extranet needs the buffers roughness"):
-        check_supported(method, lacking, alternate(0))
+        check_supported(method, lacking, (SS, ESS))
 
 
 def test_published_checkpoint_is_read_without_pytorch(tmp_path):

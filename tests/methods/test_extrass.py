@@ -17,7 +17,7 @@ from essjax.methods.rendered import albedo, hole_buffers
 from essjax.networks import frnet
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
 from essjax.warp import gbuffer_guided_warp, guides
-from tests.helpers import make_frames, random_image
+from tests.helpers import make_frames, random_image, streamed
 from tests.methods.scene import wall
 
 T, B, H, W = 5, 2, 15, 22
@@ -34,22 +34,6 @@ def random_frames(seed=0, T=T):
     return dataclasses.replace(frames, gbuffers=gbuffers, camera=None)
 
 
-@functools.cache
-def streaming(method):
-    return {kind: stream_step(method, kind) for kind in (SS, ESS)}
-
-
-def stream(method, variables, frames, kinds):
-    """Images of a stream; the colour of extrapolated frames is taken away outside already."""
-    history, images = method.start(select_time(frames, 0)), []
-    for n, kind in enumerate(kinds):
-        frame = select_time(frames, n)
-        frame = frame if kind == SS else dataclasses.replace(frame, color=jnp.full_like(frame.color, jnp.nan))
-        history, image = streaming(method)[kind](variables, history, frame)
-        images.append(image)
-    return jnp.stack(images)
-
-
 # --- extrass-w -------------------------------------------------------------------------------------------------------
 
 
@@ -63,7 +47,7 @@ def test_resting_camera_returns_the_frame():
     frames = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 3), frame)
     frames = dataclasses.replace(frames, motion=jnp.zeros_like(frames.motion), cut=frames.cut.at[1:].set(False))
     hit = jnp.isfinite(frames.gbuffers.depth[0])  # sky has one guide everywhere
-    images = stream(SHARP, {}, frames, (SS, ESS, ESS))
+    images = streamed(SHARP, {}, frames, (SS, ESS, ESS))
     np.testing.assert_array_equal(images[0], frames.color[0])
     for image in images[1:]:
         np.testing.assert_allclose(jnp.where(hit, image, 0), jnp.where(hit, frames.color[0], 0), rtol=1e-4, atol=1e-5)
@@ -73,8 +57,8 @@ def test_one_frame_by_hand():
     frames = random_frames(4)
     first, second = select_time(frames, 1), select_time(frames, 2)  # their jitters differ
     first = dataclasses.replace(first, cut=jnp.array([True, True]))
-    history, _ = streaming(SHARP)[SS]({}, SHARP.start(first), first)
-    _, image = streaming(SHARP)[ESS]({}, history, second)
+    history, _ = stream_step(SHARP, SS)({}, SHARP.start(first), first)
+    _, image = stream_step(SHARP, ESS)({}, history, second)
     assert float(jnp.abs(first.jitter - second.jitter).max()) > 0.05
     warp = jax.jit(functools.partial(gbuffer_guided_warp, sigma_guide=0.002))
     encoded = reinhard(demodulate(first.color, albedo(first.gbuffers)))
@@ -103,7 +87,7 @@ def test_extrapolations_in_a_row_follow_the_composed_motion(kinds):
     frames = dataclasses.replace(
         frames, gbuffers=flat, motion=motion, color=color, jitter=jnp.zeros_like(frames.jitter)
     )
-    images = np.asarray(stream(NEAREST, {}, frames, kinds))
+    images = np.asarray(streamed(NEAREST, {}, frames, kinds))
     dx, dy = steps[: len(kinds)].sum(axis=0)
     y, x = np.mgrid[4 : H - 4, 4 : W - 4]
     np.testing.assert_allclose(images[-1][:, y, x], picture[:, y + dy, x + dx], rtol=1e-4)
@@ -185,10 +169,10 @@ both_parities = pytest.mark.parametrize("parity", [0, 1])
 @both_parities
 def test_streaming_equals_the_rollout(busy, parity):
     frames = frames_for(parity, 0)
-    streamed = stream(METHOD, busy, frames, alternate(parity).kinds(4 + parity))
+    images = streamed(METHOD, busy, frames, alternate(parity).kinds(4 + parity))
     image = rollout(parity)(busy, frames)
     assert image.shape == (4 + parity, B, 2 * H, 2 * W, 3)
-    np.testing.assert_allclose(log1p(image), log1p(streamed), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(log1p(image), log1p(images), rtol=1e-3, atol=1e-3)
     assert bool(jnp.all(jnp.isfinite(image))) and float(image.min()) >= 0.0
 
 
@@ -233,7 +217,7 @@ def test_history_ends_at_a_cut(busy):
     np.testing.assert_array_equal(other[3:, 0], image[3:, 0])
     assert float(jnp.abs(other[3:, 1] - image[3:, 1]).max(axis=(1, 2, 3)).min()) > 1e-3  # no cut there
     alone = select_time(frames, slice(3, 5))  # the same as a stream that starts there
-    started = stream(METHOD, busy, alone, (SS, ESS))
+    started = streamed(METHOD, busy, alone, (SS, ESS))
     np.testing.assert_allclose(log1p(image[3:, 0]), log1p(started[:, 0]), rtol=1e-3, atol=1e-3)
 
 
@@ -254,7 +238,7 @@ def psnr(image, truth):
 
 def test_untrained_network_is_a_sensible_baseline(untrained):
     scene = wall(14, B, H, W)
-    images = stream(METHOD, untrained, scene.frames, alternate(0).kinds(14))
+    images = streamed(METHOD, untrained, scene.frames, alternate(0).kinds(14))
     quality = psnr(images, scene.reference)  # [T, B]
     color = scene.frames.color
     bilinear = psnr(jax.image.resize(color, images.shape, "linear"), scene.reference)

@@ -18,7 +18,7 @@ from essjax.networks._fasset import OUTPUT_GAIN
 from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
 from essjax.scenes.render import render_reference
 from essjax.warp import hole_mask, jitter_aligned_upsample
-from tests.helpers import make_frames, random_image
+from tests.helpers import make_frames, random_image, streamed
 
 T, B, H, W = 4, 2, 30, 40
 TINY = {"width": 4, "hidden": 5}
@@ -64,20 +64,8 @@ def untrained(busy):
     return variables
 
 
-@functools.cache
-def streaming(method=METHOD):
-    return {kind: stream_step(method, kind, compiler_options=FAST) for kind in (SS, ESS)}
-
-
-def stream(method, variables, frames, kinds):
-    """Images of a stream; the colour of extrapolated frames is taken away outside already."""
-    history, images = method.start(select_time(frames, 0)), []
-    for n, kind in enumerate(kinds):
-        frame = select_time(frames, n)
-        frame = frame if kind == SS else dataclasses.replace(frame, color=jnp.full_like(frame.color, jnp.nan))
-        history, image = streaming(method)[kind](variables, history, frame)
-        images.append(image)
-    return jnp.stack(images)
+step = functools.partial(stream_step, METHOD, compiler_options=FAST)
+images_of = functools.partial(streamed, METHOD, compiler_options=FAST)
 
 
 # --- Any output size -------------------------------------------------------------------------------------------------
@@ -157,10 +145,10 @@ def rollout():
 
 def test_streaming_equals_the_rollout(busy):
     frames = random_frames(0)
-    streamed = stream(METHOD, busy, frames, alternate(0).kinds(T))
+    images = images_of(busy, frames, alternate(0).kinds(T))
     image = rollout()(busy, frames)
     assert image.shape == (T, B, 45, 60, 3)
-    np.testing.assert_allclose(log1p(image), log1p(streamed), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(log1p(image), log1p(images), rtol=1e-3, atol=1e-3)
     assert bool(jnp.all(jnp.isfinite(image))) and float(image.min()) >= 0.0
 
 
@@ -191,7 +179,7 @@ def test_history_ends_at_a_cut(busy):
     image, other = rollout()(busy, frames), rollout()(busy, changed)
     np.testing.assert_array_equal(other[2:, 0], image[2:, 0])
     assert float(jnp.abs(other[2:, 1] - image[2:, 1]).max(axis=(1, 2, 3)).min()) > 1e-3  # no cut there
-    started = stream(METHOD, busy, select_time(frames, slice(2, 4)), (SS, ESS))
+    started = images_of(busy, select_time(frames, slice(2, 4)), (SS, ESS))
     np.testing.assert_allclose(log1p(image[2:, 0]), log1p(started[:, 0]), rtol=1e-3, atol=1e-3)
 
 
@@ -209,7 +197,7 @@ def test_batch_elements_are_independent(busy):
 def after_first(busy, frames):
     """The history after frame 0 was rendered."""
     first = select_time(frames, 0)
-    return streaming()[SS](busy, METHOD.start(first), first)[0]
+    return step(SS)(busy, METHOD.start(first), first)[0]
 
 
 def hidden_state(history):
@@ -227,12 +215,12 @@ def test_holes_of_the_warped_previous_frame_are_cut_from_rendered_frames(busy):
     mask = hole_mask(second.gbuffers, first.gbuffers, second.motion, jitter=second.jitter, jitter_previous=first.jitter)
     assert 0.05 < float(mask.mean()) < 0.95
     filled = dataclasses.replace(second, color=jnp.where(mask > 0, second.color, 7.0))
-    history, render = after_first(busy, frames), streaming()[SS]
+    history, render = after_first(busy, frames), step(SS)
     np.testing.assert_array_equal(render(busy, copy(history), filled)[1], render(busy, copy(history), second)[1])
     whole = fasset(scale=1.5, mask_rendered=False, **TINY)
     assert whole.info.name == "fasset-no-mask"
-    step = jax.jit(lambda *given: {k: whole.render_step(*given)[1].aux[k] for k in ("mask", "valid")})
-    aux = step(busy, history, second)  # without the image no network is compiled
+    masks = jax.jit(lambda *given: {k: whole.render_step(*given)[1].aux[k] for k in ("mask", "valid")})
+    aux = masks(busy, history, second)  # without the image no network is compiled
     np.testing.assert_array_equal(aux["valid"], mask)
     np.testing.assert_array_equal(aux["mask"], 1.0)
 
@@ -242,14 +230,14 @@ def test_only_rendered_frames_update_the_hidden_state(busy):
     history = after_first(busy, frames)
     before = np.asarray(hidden_state(history))
     assert np.abs(before).max() > 0.01
-    extrapolated, image = streaming()[ESS](busy, copy(history), select_time(frames, 1))
+    extrapolated, image = step(ESS)(busy, copy(history), select_time(frames, 1))
     np.testing.assert_array_equal(hidden_state(extrapolated), before)
     emptied = copy(history)
     frames_kept = emptied.inner.rendered.frames
     content = dataclasses.replace(frames_kept.content, hidden=jnp.zeros_like(frames_kept.content.hidden))
     kept = dataclasses.replace(emptied.inner.rendered, frames=dataclasses.replace(frames_kept, content=content))
     emptied = dataclasses.replace(emptied, inner=dataclasses.replace(emptied.inner, rendered=kept))
-    _, other = streaming()[ESS](busy, emptied, select_time(frames, 1))
+    _, other = step(ESS)(busy, emptied, select_time(frames, 1))
     assert float(jnp.abs(image - other).max()) > 1e-4  # but it is read
 
 
@@ -276,7 +264,7 @@ def test_the_hidden_state_follows_the_motion(busy, kinds):
     for clip in (frames, moved):
         history = METHOD.start(select_time(clip, 0))
         for n, kind in enumerate(kinds):
-            history, _ = streaming()[kind](busy, history, select_time(clip, n))
+            history, _ = step(kind)(busy, history, select_time(clip, n))
         states.append(np.asarray(hidden_state(history))[:, 9:-9, 9:-9])
     np.testing.assert_allclose(states[1], states[0], rtol=1e-3, atol=1e-4)
     alone = after_first(busy, dataclasses.replace(select_time(frames, slice(-1, None)), cut=jnp.ones((1, B), bool)))
@@ -316,7 +304,7 @@ def test_a_hidden_state_that_is_kept_does_not_see_the_jitter(busy):
     inner = dataclasses.replace(history.inner, rendered=dataclasses.replace(rendered, frames=kept))
     history = dataclasses.replace(history, inner=inner)
     for n, kind in ((1, ESS), (2, SS), (3, SS)):
-        history, _ = streaming()[kind](closed, history, select_time(frames, n))
+        history, _ = step(kind)(closed, history, select_time(frames, n))
     inside = (slice(None), slice(1, -1), slice(1, -1))  # the border's samples may lie off screen
     np.testing.assert_allclose(hidden_state(history)[inside], state[inside], atol=1e-5)
 
@@ -330,13 +318,13 @@ def test_history_is_read_at_output_size(untrained):
     share = jnp.array([40.0, 0.0, 0.0, 0.0])
     all_of_it = jax.tree.map(jnp.copy, untrained)
     all_of_it["fasset"]["params"]["inr"]["Dense_3"]["bias"] = share
-    images = stream(METHOD, all_of_it, frames, (SS,) * T)
+    images = images_of(all_of_it, frames, (SS,) * T)
     for image in images[1:]:
         np.testing.assert_allclose(image, images[0], rtol=1e-4, atol=1e-4)
-    assert float(jnp.abs(stream(METHOD, untrained, frames, (SS, SS))[1] - images[0]).max()) > 0.1
+    assert float(jnp.abs(images_of(untrained, frames, (SS, SS))[1] - images[0]).max()) > 0.1
     # History is no farther off than the current samples: where they are all alike nothing of it is left.
     plain = dataclasses.replace(frames, color=frames.color.at[1].set(0.7))
-    np.testing.assert_allclose(stream(METHOD, all_of_it, plain, (SS, SS))[1], 0.7, rtol=1e-4)
+    np.testing.assert_allclose(images_of(all_of_it, plain, (SS, SS))[1], 0.7, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", [SS, ESS])
@@ -349,7 +337,7 @@ def test_texture_is_that_of_the_current_frame(untrained, kind):
     gbuffers = dataclasses.replace(frames.gbuffers, depth=jnp.where(sky, 5.1, frames.gbuffers.depth))
     frames = dataclasses.replace(frames, color=jnp.where(sky, light * albedo(gbuffers), color), gbuffers=gbuffers)
     second = select_time(frames, 1)
-    image = stream(METHOD, untrained, frames, (SS, kind))[1]
+    image = images_of(untrained, frames, (SS, kind))[1]
     expected = jitter_aligned_upsample(log1p(second.color), 1.5, second.jitter)
     np.testing.assert_allclose(log1p(image), expected, rtol=1e-4, atol=1e-4)
 

@@ -12,9 +12,9 @@ from essjax.cameras import pixel_positions
 from essjax.frames import select_time, without_color
 from essjax.methods import bsr, warp_3d
 from essjax.methods.interpolation import Pair, Seen, forward_motion, interpolator
-from essjax.rollout import ESS, SS, alternate, every, stream_step, unroll
+from essjax.rollout import ESS, SS, alternate, every, unroll
 from essjax.warp import compose_motion
-from tests.helpers import make_frames, random_image
+from tests.helpers import make_frames, random_image, streamed
 
 T, B, H, W = 7, 2, 11, 16
 
@@ -34,15 +34,6 @@ def rollout(schedule):
 
 
 EVEN, ODD, EVERY = alternate(0), alternate(1), every()
-steps = {kind: stream_step(TOY, kind) for kind in (SS, ESS)}
-
-
-def stream(frames, kinds):
-    history, images = TOY.start(select_time(frames, 0)), []
-    for n, kind in enumerate(kinds):
-        history, image = steps[kind]({}, history, select_time(frames, n))
-        images.append(image)
-    return np.stack(images)
 
 
 @pytest.mark.parametrize("schedule", [EVEN, ODD], ids=["even", "odd"])
@@ -70,7 +61,7 @@ def test_streams_and_frames_that_have_no_neighbour():
     frames = make_frames(2, T=9, B=B, H=H, W=W)
     frames = dataclasses.replace(frames, cut=frames.cut.at[jnp.array([5, 8]), 0].set(True))
     kinds = (SS, SS, ESS, ESS, SS, ESS, SS, ESS, SS)
-    images, color = stream(frames, kinds), np.asarray(frames.color)
+    images, color = np.asarray(streamed(TOY, {}, frames, kinds)), np.asarray(frames.color)
     halfway = lambda a, b: 0.25 * color[a] + 0.75 * color[b]
     # Step n shows frame n - 1. Of frames 2 and 3 the first repeats frame 1.
     for step, expected in (

@@ -14,8 +14,8 @@ from essjax.frames import select_time
 from essjax.methods import jau, nsrr
 from essjax.methods._nsrr import warp_previous
 from essjax.methods.rendered import advance
-from essjax.rollout import SS, alternate, every, stream_step, unroll
-from tests.helpers import make_frames, random_image
+from essjax.rollout import alternate, every, unroll
+from tests.helpers import make_frames, random_image, streamed
 
 T, B, H, W = 7, 2, 9, 13
 METHOD = nsrr(2, width=4)
@@ -42,19 +42,6 @@ def rollout():
     return jax.jit(lambda variables, frames: unroll(METHOD, variables, frames, every()))
 
 
-@functools.cache
-def step():
-    return stream_step(METHOD, SS)
-
-
-def stream(variables, frames):
-    history, images = METHOD.start(select_time(frames, 0)), []
-    for n in range(frames.motion.shape[0]):
-        history, image = step()(variables, history, select_time(frames, n))
-        images.append(image)
-    return jnp.stack(images)
-
-
 def test_untrained_it_is_the_upsampled_frame(untrained):
     frames = frames_of(1)
     expected = unroll(jau(2), {}, frames, every()).image
@@ -65,7 +52,7 @@ def test_streaming_equals_the_rollout(busy):
     frames = frames_of(2)
     image = rollout()(busy, frames).image
     assert image.shape == (T, B, 2 * H, 2 * W, 3) and float(image.min()) >= 0
-    np.testing.assert_allclose(display(image), display(stream(busy, frames)), atol=1e-4)
+    np.testing.assert_allclose(display(image), display(streamed(METHOD, busy, frames, every().kinds(T))), atol=1e-4)
 
 
 def test_previous_frames_are_read_along_their_paths(busy):

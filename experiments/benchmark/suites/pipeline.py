@@ -1,5 +1,6 @@
 """Streaming: whole methods frame by frame, as a viewer of a game gets them. History stays on the device."""
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +12,7 @@ from essjax import methods
 from essjax.deploy import count_parameters
 from essjax.frames import Frame, without_color
 from essjax.interfaces import Method
-from essjax.rollout import ESS, SS, alternate, bake, every, stream_step, unroll
+from essjax.rollout import ESS, SS, alternate, bake, every, stream, stream_step, unroll
 from experiments.benchmark import inputs
 from experiments.benchmark.measure import Compilations, device_time, summary
 from experiments.benchmark.suites import Options, Row
@@ -37,30 +38,25 @@ def streamed_methods() -> dict[str, Method]:
     }
 
 
-def stream(
-    method: Method, steps: dict[str, Callable], frames: list, count: int, *, resident: bool = False
-) -> dict[str, np.ndarray]:
+def latencies(method: Method, dtype: str, frames: list, count: int, *, resident: bool = False) -> dict[str, np.ndarray]:
     """Seconds of each frame by kind, frame into the device and image out of it included; everything else is refused.
 
     Args:
-      method: weights built in (``bake``); says what the history is and whether every frame is rendered.
-      steps: kind -> from ``stream_step``, compiled.
+      method: weights built in (``bake``); says whether every frame is rendered.
+      dtype: of the networks.
       frames: on the host, rendered in turn.
       count: frames to stream.
       resident: frames are on the device already, and images stay there, as in a renderer on the same GPU.
     """
     kinds = (every() if method.info.renders_all else alternate()).kinds(count)
     seconds: dict[str, list[float]] = {kind: [] for kind in dict.fromkeys(kinds)}
-    history = method.start(jax.device_put(frames[0]))
-    given = {SS: frames, ESS: [without_color(frame) for frame in frames]}
-    given = jax.block_until_ready(jax.device_put(given)) if resident else given
-    for n, kind in enumerate(kinds):
+    given = jax.block_until_ready(jax.device_put(frames)) if resident else frames
+    fed = itertools.cycle(given) if resident else map(jax.device_put, itertools.cycle(given))
+    images = stream(method, {}, fed, kinds, dtype=dtype)
+    for kind in kinds:
         start = time.perf_counter()
-        frame = given[kind][n % len(frames)]
-        frame = frame if resident else jax.device_put(frame)
         with jax.transfer_guard("disallow"):
-            history, image = steps[kind]({}, history, frame)
-            image.block_until_ready()
+            image = next(images).block_until_ready()
         if not resident:
             jax.device_get(image)
         seconds[kind].append(time.perf_counter() - start)
@@ -79,16 +75,13 @@ def busy(method: Method, step: Callable, frame: Frame) -> dict[str, float]:
     return device_time(call)
 
 
-def largest_difference(method: Method, steps: dict[str, Callable], frames: list) -> float:
+def largest_difference(method: Method, frames: list) -> float:
     """Between streamed and unrolled images of the first frames, relative to the images' mean."""
-    schedule = every() if method.info.renders_all else alternate()
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames[:COMPARED])
+    schedule, frames = every() if method.info.renders_all else alternate(), frames[:COMPARED]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames)
     unrolled = jax.jit(lambda frames: unroll(method, {}, frames, schedule).image)(stacked)
-    history, worst = method.start(jax.device_put(frames[0])), 0.0
-    for n, kind in enumerate(schedule.kinds(len(frames[:COMPARED]))):
-        frame = jax.device_put(frames[n] if kind == SS else without_color(frames[n]))
-        history, image = steps[kind]({}, history, frame)
-        worst = max(worst, float(np.abs(image - unrolled[n]).max()))
+    images = stream(method, {}, map(jax.device_put, frames), schedule.kinds(len(frames)))
+    worst = max(float(np.abs(image - expected).max()) for image, expected in zip(images, unrolled, strict=True))
     return worst / float(np.abs(unrolled).mean())
 
 
@@ -105,17 +98,15 @@ def rows(options: Options) -> Iterator[Row]:
 
 def _method_rows(name: str, method: Method, frames: list, dtype: str, options: Options) -> Iterator[Row]:
     kinds = (SS,) if method.info.renders_all else (SS, ESS)
-    steps = {kind: stream_step(method, kind, dtype=dtype) for kind in kinds}
-    building = {}
-    history = method.start(jax.device_put(frames[0]))
+    building, images = {}, stream(method, {}, map(jax.device_put, frames), kinds, dtype=dtype)
+    jax.jit(method.start)(jax.device_put(frames[0]))
     for kind in kinds:
-        given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
         with Compilations() as building[kind]:
-            history, _ = jax.block_until_ready(steps[kind]({}, history, given))
-    difference = largest_difference(method, steps, frames) if dtype == "float32" else None
+            next(images).block_until_ready()
+    difference = largest_difference(method, frames) if dtype == "float32" else None
     for resident in (True, False) if jax.default_backend() == "gpu" else (False,):
         with Compilations() as streaming:
-            seconds = stream(method, steps, frames, options.frames, resident=resident)
+            seconds = latencies(method, dtype, frames, options.frames, resident=resident)
         if streaming.count:
             raise RuntimeError(f"{name}: compiled {streaming.count} times while streaming.")
         for kind in kinds:
@@ -129,7 +120,7 @@ def _method_rows(name: str, method: Method, frames: list, dtype: str, options: O
                 row["difference_from_unrolled"] = difference
             if resident:
                 given = jax.device_put(frames[0] if kind == SS else without_color(frames[0]))
-                row |= busy(method, steps[kind], given)
+                row |= busy(method, stream_step(method, kind, dtype=dtype), given)
             yield row
 
 

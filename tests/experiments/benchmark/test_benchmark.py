@@ -75,11 +75,10 @@ def test_networks_are_those_of_the_methods(forward):
 def test_streaming_is_the_unrolled_method_and_compiles_once():
     method, frames = methods.taau(), inputs.frames(3, 40, 32)
     method = bake(method, method.init(jax.random.key(0), frames[0]))
-    steps = {SS: stream_step(method, SS)}
-    assert pipeline.largest_difference(method, steps, frames) < 1e-5
-    seconds = pipeline.stream(method, steps, frames, 5)
+    assert pipeline.largest_difference(method, frames) < 1e-5
+    seconds = pipeline.latencies(method, "float32", frames, 5)
     assert set(seconds) == {SS} and seconds[SS].shape == (5,) and (seconds[SS] > 0).all()
-    assert steps[SS]._cache_size() == 1
+    assert stream_step(method, SS)._cache_size() == 1
 
 
 def test_latency_counts_every_frame():
