@@ -128,7 +128,8 @@ def metered(method: Method) -> Method:
 
         return run
 
-    return Method(init, start, measuring(method.render_step), measuring(method.extrapolate_step), method.info)
+    steps = {"render_step": measuring(method.render_step), "extrapolate_step": measuring(method.extrapolate_step)}
+    return method._replace(init=init, start=start, **steps)
 
 
 def _metered_parts(method: Method, parts: Parts) -> Method:

@@ -347,6 +347,25 @@ def without_color(frame: Frame) -> Frame:
     return dataclasses.replace(frame, color=None)
 
 
+def example_frame(width: int, height: int) -> Frame:
+    """Make the shapes of one frame ``[1, H, W, C]`` with every buffer (``jax.ShapeDtypeStruct`` leaves)."""
+
+    def leaf(*shape: int, dtype: Any = jnp.float32) -> Any:
+        return jax.ShapeDtypeStruct((1, *shape), dtype)
+
+    def image(name: str) -> Any:
+        return leaf(height, width, BUFFERS[name].channels, dtype=jnp.int32 if name == "stencil" else jnp.float32)
+
+    return Frame(
+        color=image("color"),
+        gbuffers=GBuffers(**{name: image(name) for name in ("depth", *OPTIONAL_GBUFFERS)}),
+        motion=image("motion"),
+        jitter=leaf(2),
+        cut=leaf(dtype=jnp.bool_),
+        exposure=leaf(),
+    )
+
+
 def background(gbuffers: GBuffers) -> jax.Array:
     """Bool ``[..., H, W, 1]``: true where nothing was hit (depth +inf)."""
     return ~jnp.isfinite(gbuffers.depth)

@@ -90,26 +90,6 @@ class Parted:
     shown: PyTree
 
 
-class Method(NamedTuple):
-    """A pair of pure steps with what they need.
-
-    Attributes:
-      init: ``(key, example) -> variables``.
-      start: ``(example) -> history``, a pytree of arrays.
-      render_step: for a frame with colour (SS).
-      extrapolate_step: for a frame without (ESS).
-      info: see ``MethodInfo``.
-      parts: of the steps where they have such; None after a change to the steps alone.
-    """
-
-    init: Init
-    start: Start
-    render_step: Step
-    extrapolate_step: Step
-    info: MethodInfo
-    parts: Parts | None = None
-
-
 class Network(NamedTuple):
     """A neural network as two pure functions.
 
@@ -120,6 +100,49 @@ class Network(NamedTuple):
 
     init: Any
     apply: Any
+
+
+class Recipe(NamedTuple):
+    """How ``methods.make`` makes a method again.
+
+    Attributes:
+      name: of its factory.
+      arguments: (name, value) of each of the factory's arguments, defaults too; a value may be a method.
+    """
+
+    name: str
+    arguments: tuple[tuple[str, Any], ...]
+
+
+class Method(NamedTuple):
+    """A pair of pure steps with what they need.
+
+    Attributes:
+      init: ``(key, example) -> variables``.
+      start: ``(example) -> history``, a pytree of arrays.
+      render_step: for a frame with colour (SS).
+      extrapolate_step: for a frame without (ESS).
+      info: see ``MethodInfo``.
+      parts: of the steps where they have such; None after a change to the steps alone.
+      networks: (entry of the variables, network) of those that an objective applies by themselves.
+      recipe: how it was made, where a factory of ``essjax.methods`` did.
+    """
+
+    init: Init
+    start: Start
+    render_step: Step
+    extrapolate_step: Step
+    info: MethodInfo
+    parts: Parts | None = None
+    networks: tuple[tuple[str, Network], ...] = ()
+    recipe: Recipe | None = None
+
+    def network(self, entry: str) -> Network:
+        """Return the network whose variables are ``entry``; a ValueError if there is none."""
+        if entry not in dict(self.networks):
+            names = ", ".join(dict(self.networks)) or "none"
+            raise ValueError(f"{self.info.name}: expected a method with a network {entry!r}; its networks: {names}.")
+        return dict(self.networks)[entry]
 
 
 def from_parts(init: Init, start: Start, parts: Parts, info: MethodInfo) -> Method:

@@ -71,7 +71,7 @@ def _read_safetensors(path: Path, prefix: str) -> dict[str, np.ndarray]:
 def map_safetensors(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a safetensors file by name, read from the disk where they are used (bfloat16 at once).
 
-    The format is a JSON header and raw arrays: these lines are less than a dependency.
+    safetensors' own reader has no bfloat16 for NumPy and copies everything.
     """
     data = np.memmap(path, np.uint8, mode="r")
     header_end = 8 + int.from_bytes(data[:8].tobytes(), "little")

@@ -1,5 +1,5 @@
 """What a method costs where it runs."""
 
-from essjax.deploy.cost import Cost, count_parameters, example_frame, method_cost, multiply_adds
+from essjax.deploy.cost import Cost, count_parameters, method_cost, multiply_adds
 
-__all__ = ["Cost", "count_parameters", "example_frame", "method_cost", "multiply_adds"]
+__all__ = ["Cost", "count_parameters", "method_cost", "multiply_adds"]

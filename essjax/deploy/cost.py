@@ -4,9 +4,8 @@ import math
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
-from essjax.frames import Frame, GBuffers, without_color
+from essjax.frames import example_frame, without_color
 from essjax.interfaces import Method
 from essjax.kernels import plain
 from essjax.rollout import ESS, SS
@@ -69,26 +68,6 @@ def multiply_adds(function, *arguments: PyTree) -> int:
     """
     with plain():  # in a new function: JAX may remember how it traced the old one
         return _count(jax.make_jaxpr(lambda *arguments: function(*arguments))(*arguments).jaxpr)
-
-
-def example_frame(width: int, height: int) -> Frame:
-    """Shapes of one frame ``[1, H, W, C]`` with every buffer (``jax.ShapeDtypeStruct`` leaves)."""
-
-    def image(channels: int, dtype: Any = jnp.float32) -> Any:
-        return jax.ShapeDtypeStruct((1, height, width, channels), dtype)
-
-    gbuffers = GBuffers(
-        base_color=image(3), normal=image(3), depth=image(1), roughness=image(1), metallic=image(1),
-        specular=image(1), world_position=image(3), stencil=image(1, jnp.int32), n_dot_v=image(1),
-    )  # fmt: skip
-    return Frame(
-        color=image(3),
-        gbuffers=gbuffers,
-        motion=image(2),
-        jitter=jax.ShapeDtypeStruct((1, 2), jnp.float32),  # type: ignore[arg-type]
-        cut=jax.ShapeDtypeStruct((1,), bool),  # type: ignore[arg-type]
-        exposure=jax.ShapeDtypeStruct((1,), jnp.float32),  # type: ignore[arg-type]
-    )
 
 
 def _depends(function, arguments: tuple, which: int) -> bool:

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, depth_scale, rendered_color
-from essjax.interfaces import Method, MethodInfo, Network, expand_flag, refuse_extrapolation, reset_at_cut
+from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation, reset_at_cut
+from essjax.methods.registry import registered
 from essjax.methods.shots import upsampled_reactive
 from essjax.networks import classifier_network, composition_network
 from essjax.typing import Array, Callable, Color, Flag, Image, Mask, Motion, Plane, pytree
@@ -195,11 +196,7 @@ def _inverse_sigmoid(share: Array) -> Array:
     return jnp.log(share) - jnp.log1p(-share)
 
 
-def classification_network(width: int = 32) -> Network:
-    """The classification network of ``classifier(width=width)``."""
-    return classifier_network(width, prior=PRIOR)
-
-
+@registered
 def classifier(
     scale: int = 2, *, width: int = 32, composition_width: int = 64, alpha: float = 0.5, sigma: float = 0.8
 ) -> Method:
@@ -217,7 +214,7 @@ def classifier(
       alpha: smallest share of a sample on its own output pixel, before training.
       sigma: of the Gaussian that says how near a sample is, output pixels.
     """
-    network, composition = classification_network(width), composition_network(composition_width)
+    network, composition = classifier_network(width, prior=PRIOR), composition_network(composition_width)
 
     def start(example: Frame) -> History:
         *lead, height, low_width, _ = example.motion.shape
@@ -290,4 +287,6 @@ def classifier(
         return new, Prediction(image=new.image, aux=aux, state=states)
 
     info = MethodInfo("classifier", scale=scale, predicts=frozenset({"ss"}), renders_all=True)
-    return exposed(Method(init, start, render_step, refuse_extrapolation("classifier"), info), map_colors)
+    networks = (("classifier", network),)
+    method = Method(init, start, render_step, refuse_extrapolation("classifier"), info, networks=networks)
+    return exposed(method, map_colors)

@@ -12,6 +12,7 @@ from essjax.exposure import metered
 from essjax.frames import Frame, Prediction, without_color
 from essjax.interfaces import Method, MethodInfo, Step, no_variables
 from essjax.methods._taau import taa
+from essjax.methods.registry import registered
 from essjax.methods.shots import continued
 from essjax.typing import Callable, Color
 
@@ -118,6 +119,7 @@ def settled(method: Method) -> Method:
     )
 
 
+@registered
 def with_taa(first: Method, *, alpha: float = 0.5, sigma: float = 0.5) -> Method:
     """``first`` on native-resolution frames, then temporal anti-aliasing of every frame (ExtraSS Table 3).
 

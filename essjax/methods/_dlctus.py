@@ -15,6 +15,7 @@ from essjax.color import reinhard, reinhard_inverse
 from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation
+from essjax.methods.registry import registered
 from essjax.methods.shots import continued, without_history
 from essjax.networks import dlctus_network
 from essjax.typing import Array, Callable, Image, Motion, Plane
@@ -84,6 +85,7 @@ def _name(reprojection: str, dilate: bool, accumulation: bool) -> str:
     return "-".join(["dlctus", *(part for part in parts if part)])
 
 
+@registered
 def dlctus(
     scale: int = 2,
     *,

@@ -16,6 +16,7 @@ from essjax.color import demodulate, expm1, log1p, modulate
 from essjax.exposure import exposed
 from essjax.frames import Frame, GBuffers, Prediction, background, rendered_color, require, surface_guides
 from essjax.interfaces import Method, MethodInfo, expand_flag
+from essjax.methods.registry import registered
 from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_shading, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
 from essjax.networks._extranet import FRAMES, input_shapes
@@ -135,6 +136,7 @@ def network_inputs(
     return jax.lax.stop_gradient(inputs)
 
 
+@registered
 def extranet(*, history: bool = True, occlusion: bool = True, published: bool = False) -> Method:
     """ExtraNet: extrapolates frames between rendered ones at low resolution; rendered ones are returned as they are.
 

@@ -25,6 +25,7 @@ from essjax.frames import (
     surface_guides,
 )
 from essjax.interfaces import Method, MethodInfo, reset_at_cut
+from essjax.methods.registry import registered
 from essjax.methods.rendered import (
     GUIDED,
     Memory,
@@ -228,6 +229,7 @@ def sample_nearness(height: int, width: int, scale: float, jitter: Jitter) -> Ma
     return jnp.exp(-0.5 * distance / SAMPLE_SIGMA**2)[..., None]
 
 
+@registered
 def fasset(
     *,
     scale: float = 2,

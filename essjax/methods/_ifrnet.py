@@ -11,9 +11,11 @@ import jax.numpy as jnp
 from essjax.color import expm1, log1p
 from essjax.interfaces import Method
 from essjax.methods.interpolation import interpolator
+from essjax.methods.registry import registered
 from essjax.networks._ifrnet import ifrnet as ifrnet_network
 
 
+@registered
 def ifrnet(*, width: int = 24) -> Method:
     """Interpolates between rendered frames, at their resolution.
 
@@ -36,4 +38,4 @@ def ifrnet(*, width: int = 24) -> Method:
         output, _ = network.apply(variables["ifrnet"], images, prior, train=train)
         return expm1(output["image"]), output
 
-    return interpolator("ifrnet", between, init=init)
+    return interpolator("ifrnet", between, init=init)._replace(networks=(("ifrnet", network),))

@@ -15,6 +15,7 @@ from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, depth_scale, network_depth, rendered_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
 from essjax.methods.baselines import jau_image
+from essjax.methods.registry import registered
 from essjax.methods.rendered import Memory, advance, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
 from essjax.networks._nsrr import FEATURES, PREVIOUS, RGBD
@@ -52,6 +53,7 @@ def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
     return warped * jitter_aligned_upsample(frames.trust, scale, frame.jitter, mode="nearest")
 
 
+@registered
 def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool = False) -> Method:
     """Neural supersampling of a sequence that is rendered in every frame.
 

@@ -13,6 +13,7 @@ from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
+from essjax.methods.registry import registered
 from essjax.methods.shots import path_trust, upsampled_reactive, within_shots
 from essjax.typing import Array, PyTree
 from essjax.warp import (
@@ -181,6 +182,7 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
     return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance))
 
 
+@registered
 def taau(
     scale: int = 2,
     *,
@@ -226,6 +228,7 @@ def taau(
     return _accumulator("taau", settings, alpha, sigma, half=False, native=False)
 
 
+@registered
 def taau_half(
     scale: int = 2,
     *,
@@ -234,17 +237,20 @@ def taau_half(
     clamp: str = "ycocg",
     dilate: bool = True,
     history_mode: str = "bicubic",
-    **options: str,
+    rectification: str = "clamp",
+    kernel: str = "gaussian",
+    accumulation: str = "bounded",
 ) -> Method:
     """``taau`` on rendered frames only; in between, its last output warped by motion. Same arguments.
 
     The history stays the last *rendered* output, and motion is composed along the path to it: every image, rendered or
     not, is one resampling away from it, however many frames lie between.
     """
-    settings = Settings(scale, clamp, dilate, history_mode, **options)
+    settings = Settings(scale, clamp, dilate, history_mode, rectification, kernel, accumulation)
     return _accumulator("taau-half", settings, alpha, sigma, half=True, native=False)
 
 
+@registered
 def taa(
     *,
     alpha: float = 0.5,
@@ -252,13 +258,16 @@ def taa(
     clamp: str = "ycocg",
     dilate: bool = True,
     history_mode: str = "bicubic",
-    **options: str,
+    rectification: str = "clamp",
+    kernel: str = "gaussian",
+    accumulation: str = "bounded",
 ) -> Method:
     """Temporal anti-aliasing of native-resolution frames with their own jitter: ``taau`` at scale 1. Same arguments."""
-    settings = Settings(1, clamp, dilate, history_mode, **options)
+    settings = Settings(1, clamp, dilate, history_mode, rectification, kernel, accumulation)
     return _accumulator("taa", settings, alpha, sigma, half=False, native=True)
 
 
+@registered
 def tus(scale: int = 2, *, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
     """The TUS row of thesis 002 (section 5.3.1): history clamping, bicubic reprojection (a = -0.75), no dilation.
 

@@ -9,6 +9,7 @@ from essjax.color import reinhard, reinhard_inverse
 from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color
 from essjax.interfaces import Method, MethodInfo, no_variables
+from essjax.methods.registry import registered
 from essjax.methods.shots import within_shots
 from essjax.typing import Array, Callable, Image, PyTree
 from essjax.warp import backward_warp, compose_motion, jitter_aligned_upsample, jittered_motion
@@ -49,6 +50,7 @@ def _without_jitter(frame: Frame) -> Frame:
     return dataclasses.replace(frame, jitter=jnp.zeros_like(frame.jitter))
 
 
+@registered
 def bilinear(scale: float = 2) -> Method:
     """Bilinear upscaling of each rendered frame in x / (1 + x); like a plain upscaler it ignores the jitter.
 
@@ -60,6 +62,7 @@ def bilinear(scale: float = 2) -> Method:
     return _spatial("bilinear", scale, lambda frame: jau_image(_without_jitter(frame), scale, "bilinear"))
 
 
+@registered
 def bicubic(scale: float = 2) -> Method:
     """Bicubic (a = -0.5) upscaling of each rendered frame on x / (1 + x); ignores the jitter. See ``bilinear``.
 
@@ -69,6 +72,7 @@ def bicubic(scale: float = 2) -> Method:
     return _spatial("bicubic", scale, lambda frame: jau_image(_without_jitter(frame), scale, "bicubic"))
 
 
+@registered
 def jau(scale: float = 2, *, mode: str = "bilinear") -> Method:
     """Jitter-aligned upsampling of each rendered frame: it reads where the samples really lie. See ``bilinear``.
 
@@ -96,6 +100,7 @@ def gaussian_blur(image: Image, std: float) -> Array:
     return image
 
 
+@registered
 def warp(*, blur: float = 0.0) -> Method:
     """Plain bilinear backward warp of the last rendered LR frame to the sample positions of the current one.
 

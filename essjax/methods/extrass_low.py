@@ -10,6 +10,7 @@ from essjax.color import expm1, log1p, sum_channels
 from essjax.exposure import exposed
 from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require, select_time, surface_guides
 from essjax.interfaces import Method, MethodInfo, Network, no_variables
+from essjax.methods.registry import registered
 from essjax.methods.rendered import (
     GUIDED,
     Memory,
@@ -34,6 +35,7 @@ REFINE_DELTA = 0.1
 """delta_1 = delta_2 of eq 6."""
 
 
+@registered
 def extrass_w(
     *, sigma_guide: float | tuple[float, ...] = SIGMA_GUIDE, sigma_distance: float = SIGMA_DISTANCE
 ) -> Method:
@@ -155,6 +157,7 @@ def frnet_inputs(example: Frame) -> tuple[Image, Image]:
     return jnp.stack([half, half]), half[..., :1]
 
 
+@registered
 def extrass_e(
     *,
     width: int = 16,
@@ -186,4 +189,5 @@ def extrass_e(
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
     info = MethodInfo("extrass-e", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
-    return within_shots(exposed(Method(init, start_pair, render_step, extrapolate_step, info), map_shading))
+    method = Method(init, start_pair, render_step, extrapolate_step, info, networks=(("frnet", network),))
+    return within_shots(exposed(method, map_shading))

@@ -12,6 +12,7 @@ from essjax.methods._composed import composed
 from essjax.methods._extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
 from essjax.methods._nsrr import nsrr
 from essjax.methods.baselines import jau_image
+from essjax.methods.registry import registered
 from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_shading, push, reset_memory, start_memory
 from essjax.methods.shots import within_shots
 from essjax.networks._extranet import FRAMES, input_shapes
@@ -54,6 +55,7 @@ def enlarge(frame: Frame, scale: int, color: Color | None) -> Frame:
     )
 
 
+@registered
 def extranet_nsrr(scale: int = 2, *, width: int = 32) -> Method:
     """ExtraNet, then NSRR on every frame. ``variables = {"extranet", "nsrr"}``, trained separately.
 
@@ -66,6 +68,7 @@ def extranet_nsrr(scale: int = 2, *, width: int = 32) -> Method:
     return composed("extranet+nsrr", extranet(), nsrr(scale, width=width, half=True), extrapolates=True)
 
 
+@registered
 def nsrr_extranet(scale: int = 2, *, width: int = 32) -> Method:
     """NSRR on rendered frames, then ExtraNet at output size on upsampled G-buffers. The variables of ``extranet_nsrr``.
 
@@ -97,6 +100,7 @@ def _without_gaps(seen: Inputs) -> Inputs:
     )
 
 
+@registered
 def extranet_plus(scale: int = 2) -> Method:
     """ExtraNet+: ExtraNet at output size on zero-upsampled frames; it fills what was disoccluded and what lies between.
 

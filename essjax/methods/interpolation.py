@@ -15,6 +15,7 @@ from essjax.cameras import pixel_positions
 from essjax.exposure import exposed
 from essjax.frames import Frame, Prediction, rendered_color, select_time
 from essjax.interfaces import Init, Method, MethodInfo, expand_flag, no_variables
+from essjax.methods.registry import registered
 from essjax.methods.rendered import Memory, advance, map_content, push, reset_memory, start_memory
 from essjax.methods.shots import unlit
 from essjax.typing import Callable, Color, Flag, Jitter, Mask, Motion, Plane, PyTree, pytree
@@ -185,6 +186,7 @@ def _halves(pair: Pair) -> list[tuple[Seen, Motion, Jitter]]:
     ]
 
 
+@registered
 def warp_3d() -> Method:
     """Forward warping of both rendered frames to the time between them (Mark et al. 1997).
 
@@ -230,6 +232,7 @@ def fixed_point(half: Motion, jitter: Jitter, jitter_wanted: Jitter, iterations:
     return lookup, (residual < 0.5).astype(half.dtype)
 
 
+@registered
 def bsr(*, iterations: int = 4) -> Method:
     """Bidirectional reprojection (Yang et al. 2011): fixed-point search in both rendered frames, then a blend.
 

@@ -5,8 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from essjax.deploy import example_frame
-from essjax.frames import Frame
+from essjax.frames import Frame, example_frame
 from essjax.typing import PyTree
 
 MOTION = 6.0

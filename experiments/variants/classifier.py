@@ -19,9 +19,7 @@ def _classifier(config: Config) -> Method:
 
 def _classification(config: Config) -> Stage:
     method = _classifier(config)
-    objective = classification_objective(
-        method, methods.classification_network(config.first_width), thresholds=thresholds(config)
-    )
+    objective = classification_objective(method, thresholds=thresholds(config))
     budget, rate = first_budget(config), config.first_learning_rate
     return Stage("classifier", method, objective, config.first_batch, rate, budget, ranges=True)
 

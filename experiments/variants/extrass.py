@@ -3,7 +3,6 @@
 from essjax import methods
 from essjax.interfaces import Method
 from essjax.losses import vgg16_features
-from essjax.networks import frnet
 from essjax.train import extrass_objective, frnet_objective
 from experiments.config import Config
 from experiments.variants.base import Stage, Variant, first_budget, main_budget
@@ -22,7 +21,7 @@ def _frnet_stage(config: Config) -> Stage:
     return Stage(
         "frnet",
         method,
-        frnet_objective(method, frnet(config.first_width), feature_weight=config.feature_weight),
+        frnet_objective(method, feature_weight=config.feature_weight),
         config.first_batch,
         config.first_learning_rate,
         first_budget(config),

@@ -2,7 +2,6 @@
 
 from essjax import methods
 from essjax.interfaces import Method
-from essjax.networks import ifrnet
 from essjax.train import ifrnet_objective
 from experiments.config import Config
 from experiments.variants.base import Stage, Variant, main_budget
@@ -18,7 +17,7 @@ def _ifrnet_taa(config: Config) -> Method:
 
 def _stages(config: Config) -> list[Stage]:
     method = _ifrnet(config)
-    objective = ifrnet_objective(method, ifrnet(config.width), feature_weight=config.feature_weight)
+    objective = ifrnet_objective(method, feature_weight=config.feature_weight)
     return [Stage("ifrnet", method, objective, config.batch, config.learning_rate, main_budget(config))]
 
 

@@ -19,8 +19,11 @@ T, B, H, W = 4, 2, 5, 7
 AT = Thresholds(ghosting_depth=0.3, ghosting_velocity=4.0, opening=2)
 
 
-def fake(aux_of):
-    """A method whose aux follows from its variables and the number of the frame since the start."""
+def fake(aux_of, apply=None):
+    """A method whose aux follows from its variables and the number of the frame since the start.
+
+    Its classifier is ``apply``.
+    """
 
     def start(example):
         return jnp.zeros((), jnp.int32)
@@ -30,7 +33,8 @@ def fake(aux_of):
         aux = aux_of(variables, history)
         return history + 1, Prediction(image=jnp.zeros((B, 2 * H, 2 * W, 3)), aux=aux)
 
-    return exposed(Method(lambda key, example: {}, start, step, step, MethodInfo("fake", 2, renders_all=True)))
+    info, networks = MethodInfo("fake", 2, renders_all=True), (("classifier", Network(None, apply)),)
+    return exposed(Method(lambda key, example: {}, start, step, step, info, networks=networks))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +54,7 @@ def test_classification(clip):
     def aux(variables, n):
         return {"inputs": inputs[n] * variables["classifier"]["w"], "known": known[n]}
 
-    objective = classification_objective(fake(aux), Network(lambda *_: {}, apply), thresholds=AT, balance=0.5)
+    objective = classification_objective(fake(aux, apply), thresholds=AT, balance=0.5)
 
     def loss(w):
         terms, state = objective({"classifier": {"w": w}}, clip)
@@ -97,6 +101,6 @@ def test_composition(clip):
 
 
 def test_a_clip_without_ranges_says_where_they_come_from(clip):
-    objective = classification_objective(fake(lambda *_: {}), Network(None, None))
+    objective = classification_objective(fake(lambda *_: {}))
     with pytest.raises(ValueError, match="classifier: .* Render the scenes with --ranges; imported frames have none"):
         objective({}, dataclasses.replace(clip, ranges=None))

@@ -99,8 +99,8 @@ def test_frnet_learns_from_frames_with_two_pictures():
             times = jnp.where(place(frame) < limit, GARBAGE, 1.0)
             return {"extrapolated": Half(half * times, [level * times for level in levels])} if kind else {}
 
-        network = Network(None, lambda variables, image, method: ([image[..., :2]], {}))
-        objective = frnet_objective(fake(aux), network)
+        networks = (("frnet", Network(None, lambda variables, image, method: ([image[..., :2]], {}))),)
+        objective = frnet_objective(fake(aux)._replace(networks=networks))
         return jax.jit(lambda clip: objective({"frnet": 0.0}, clip)[0])(clip_of((4, 0), (3, 1)))
 
     good, bad, worse = terms(0), terms(3), terms(4)
@@ -141,7 +141,8 @@ def ifrnet():
         image = jnp.broadcast_to(IMAGE[:H, :W], (*frame.cut.shape, H, W, 3))
         return {"image": image, "mean": 0.0 * image[..., :1, :1, :1], "features": [image[..., :2]]}
 
-    return ifrnet_objective(training(aux), Network(None, lambda variables, image, method: ([image[..., 1:]], {})))
+    network = Network(None, lambda variables, image, method: ([image[..., 1:]], {}))
+    return ifrnet_objective(training(aux)._replace(networks=(("ifrnet", network),)))
 
 
 def training(aux):

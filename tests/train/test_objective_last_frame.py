@@ -127,7 +127,8 @@ def test_ifrnet_terms_equal_numpy():
         small = image[:, ::2, ::2]
         return [variables * small[..., :2], small[..., 1:] ** 2, small[..., :2] + 1.0, small], {}
 
-    objective = ifrnet_objective(fake(aux, seen), Network(None, encode), feature_weight=0.5)
+    method = fake(aux, seen)._replace(networks=(("ifrnet", Network(None, encode)),))
+    objective = ifrnet_objective(method, feature_weight=0.5)
     clip = clip_of()
     terms, state = jax.jit(objective)({"ifrnet": jnp.float32(2.0)}, clip)
     assert ("ess", False) in seen and seen[-1] == ("ss", True) and state == STATE

@@ -225,7 +225,8 @@ def test_frnet_terms_equal_numpy(length, first):
         return [variables * image[..., :2], image[..., 1:] ** 2], {}
 
     clip = numbered(length)
-    objective = frnet_objective(fake(aux), Network(None, encode), feature_weight=0.5)
+    method = fake(aux)._replace(networks=(("frnet", Network(None, encode)),))
+    objective = frnet_objective(method, feature_weight=0.5)
     terms, _ = jax.jit(objective)({"frnet": jnp.float32(2.0)}, clip)
 
     scored = np.arange(first, length - 1)

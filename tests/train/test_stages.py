@@ -1,6 +1,7 @@
 """Both stages on one tiny clip: the loss falls, only the trained part moves, and NaN changes nothing."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,7 @@ import numpy as np
 import pytest
 
 from essjax.frames import select_time
-from essjax.methods import extrass, extrass_e
-from essjax.networks import frnet
+from essjax.methods import extrass, extrass_e, warp
 from essjax.train import create_state, extrass_objective, frnet_objective, make_train_step, optimizer
 from tests.methods.scene import wall
 
@@ -31,7 +31,7 @@ def variables(clip):
 def stage(request, clip, variables):
     """Name, jitted step and initial variables of a stage."""
     if request.param == "frnet":
-        objective, variables = frnet_objective(extrass_e(width=4), frnet(4)), {"frnet": variables["frnet"]}
+        objective, variables = frnet_objective(extrass_e(width=4)), {"frnet": variables["frnet"]}
     else:
         objective = extrass_objective(extrass(width=4, frnet_width=4))
     return request.param, make_train_step(objective, optimizer(), request.param), variables
@@ -67,3 +67,9 @@ def test_nan_keeps_the_old_variables(stage, clip):
     assert not np.isfinite(float(terms["loss"]))
     jax.tree.map(np.testing.assert_array_equal, state.variables, variables)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.optimizer))
+
+
+def test_an_objective_says_which_network_its_method_lacks():
+    message = "warp: expected a method with a network 'frnet'; its networks: none."
+    with pytest.raises(ValueError, match=re.escape(message)):
+        frnet_objective(warp())

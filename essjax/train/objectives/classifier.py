@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from essjax.color import expose, reinhard
 from essjax.frames import SampleRanges, Sequence
-from essjax.interfaces import Method, Network
+from essjax.interfaces import Method
 from essjax.labels import ALIASING, DEFAULTS, GHOSTING, Thresholds, label_sequence
 from essjax.losses import class_weights, cross_entropy, l1, masked_mean, temporal_l1
 from essjax.networks.blocks import nearest_upsample
@@ -24,9 +24,7 @@ def required_ranges(clip: Sequence) -> SampleRanges:
     return clip.ranges
 
 
-def classification_objective(
-    method: Method, network: Network, *, thresholds: Thresholds = DEFAULTS, balance: float = 0.25
-) -> Objective:
+def classification_objective(method: Method, *, thresholds: Thresholds = DEFAULTS, balance: float = 0.25) -> Objective:
     """Cross-entropy of both classes against automatic labels, classes balanced.
 
     First the method runs over the clip, as it does at inference; what its classifier saw is then classified again, all
@@ -36,10 +34,10 @@ def classification_objective(
 
     Args:
       method: ``classifier``.
-      network: its classification network.
       thresholds: of the labels; ``Thresholds.of_height`` of the whole image, not of the crop.
       balance: see ``losses.class_weights``.
     """
+    network = method.network("classifier")
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         ranges = required_ranges(clip)

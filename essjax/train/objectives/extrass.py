@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from essjax.color import expm1, expose, log1p
 from essjax.frames import Sequence, rendered_color
-from essjax.interfaces import Method, Network
+from essjax.interfaces import Method
 from essjax.losses import (
     census,
     charbonnier,
@@ -41,17 +41,17 @@ WITH_TWO_PICTURES = 3
 """The first frame of a shot that each run extrapolates from two rendered frames: at 1 and 2 both are the same one."""
 
 
-def frnet_objective(method: Method, network: Network, *, feature_weight: float = 0.001) -> Objective:
+def frnet_objective(method: Method, *, feature_weight: float = 0.001) -> Objective:
     """L_FR of ExtraSS eq 7-9: Charbonnier + census on the half-size output, census on features.
 
     From the fourth frame of a shot on: before, the two rendered frames that FRNet compares are one and the same. Of
     three frames, where only frame 1 is extrapolated, that one.
 
     Args:
-      method: ``extrass_e``.
-      network: its FRNet, whose encoder makes the ground truth's features.
+      method: ``extrass_e``; the encoder of its FRNet makes the ground truth's features.
       feature_weight: lambda of eq 9.
     """
+    network = method.network("frnet")
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         clip = odd_length(clip)

@@ -4,21 +4,21 @@ import jax
 
 from essjax.color import expose, log1p
 from essjax.frames import Sequence, rendered_color, select_time
-from essjax.interfaces import Method, Network
+from essjax.interfaces import Method
 from essjax.losses import census, charbonnier, feature_census
 from essjax.rollout import alternate
 from essjax.train.objectives.common import Objective, frame_mean, predict_last, since_cut
 from essjax.typing import Array, PyTree
 
 
-def ifrnet_objective(method: Method, network: Network, *, feature_weight: float = 0.01) -> Objective:
+def ifrnet_objective(method: Method, *, feature_weight: float = 0.01) -> Objective:
     """Charbonnier, census and feature geometry of the middle one of a clip's last three frames, if no cut is between.
 
     Args:
-      method: ``ifrnet``.
-      network: its network, whose encoder makes the target's features.
+      method: ``ifrnet``; its network's encoder makes the target's features.
       feature_weight: of the feature space geometry loss.
     """
+    network = method.network("ifrnet")
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         length = clip.frames.motion.shape[0]
