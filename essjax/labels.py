@@ -97,7 +97,7 @@ def _windows(marks: Marks, size: int, axis: int) -> Marks:
     return jnp.stack([jax.lax.slice_in_dim(marks, k, k + length, axis=axis) for k in range(size)])
 
 
-def opening(marks: Marks, size: int = 5) -> Marks:
+def opening(marks: Marks, *, size: int = 5) -> Marks:
     """Erosion, then dilation with a square: what is left is the union of all ``size`` x ``size`` squares of marks.
 
     Squares may stick out of the image. 5 is our reading of "opening twice" (3 x 3): eroded twice, then dilated twice;
@@ -118,7 +118,7 @@ def _unlike(closeness: Plane, velocity: Array, other_closeness: Plane, other_vel
     return closer & moves
 
 
-def visibility_ghosting(ranges: SampleRanges, previous: SampleRanges, at: Thresholds = DEFAULTS) -> Marks:
+def visibility_ghosting(ranges: SampleRanges, previous: SampleRanges, *, at: Thresholds = DEFAULTS) -> Marks:
     """Pixels whose history shows a closer surface that moves otherwise (eq 1 and 2), or is off screen.
 
     Then dilated by a pixel onto neighbours that are farther and move otherwise (eq 3 and 4).
@@ -152,7 +152,7 @@ def color_overlap(low: Image, high: Image, other_low: Image, other_high: Image) 
 
 
 def shading_ghosting(
-    ranges: SampleRanges, previous: SampleRanges, at: Thresholds = DEFAULTS, *, exposure: Scalar | float = 1.0
+    ranges: SampleRanges, previous: SampleRanges, *, at: Thresholds = DEFAULTS, exposure: Scalar | float = 1.0
 ) -> Marks:
     """Pixels whose colour changed along the motion (|eq 5| in any channel, and eq 6), opened, not yet corrected.
 
@@ -173,29 +173,29 @@ def shading_ghosting(
     other_low, other_high = there[..., :3], there[..., 3:]
     changed = jnp.max(jnp.abs(high - other_high), axis=-1, keepdims=True) > at.ghosting_color
     different = color_overlap(low, high, other_low, other_high) < at.ghosting_overlap
-    return opening(changed & different, at.opening)
+    return opening(changed & different, size=at.opening)
 
 
-def geometry_aliasing(ranges: SampleRanges, at: Thresholds = DEFAULTS) -> Marks:
+def geometry_aliasing(ranges: SampleRanges, *, at: Thresholds = DEFAULTS) -> Marks:
     """Pixels that hold a depth or normal edge, bump detail left out: A_G (eq 7 or 8)."""
     closest, farthest = _closeness(ranges.depth_min), _closeness(ranges.depth_max)
     return (closest - farthest > at.aliasing_depth * closest) | (ranges.normal_spread_smooth > at.aliasing_normal)
 
 
-def texture_aliasing(ranges: SampleRanges, at: Thresholds = DEFAULTS) -> Marks:
+def texture_aliasing(ranges: SampleRanges, *, at: Thresholds = DEFAULTS) -> Marks:
     """Pixels that hold other detail: A_T, all of eq 7, 8 (with bumps) or 9 without A_G."""
     bumps = ranges.normal_spread > at.aliasing_normal
     difference = ranges.color_max - ranges.color_min
     varied = jnp.any(difference > at.aliasing_color * ranges.color_max, axis=-1, keepdims=True)
-    return (bumps | varied) & ~geometry_aliasing(ranges, at)
+    return (bumps | varied) & ~geometry_aliasing(ranges, at=at)
 
 
 def label(
     ranges: SampleRanges,
     previous: SampleRanges,
     cut: Flag,
-    at: Thresholds = DEFAULTS,
     *,
+    at: Thresholds = DEFAULTS,
     exposure: Scalar | float = 1.0,
 ) -> Labels:
     """Both classes of every pixel of one frame.
@@ -210,9 +210,9 @@ def label(
       at: thresholds.
       exposure: see ``shading_ghosting``.
     """
-    visibility = visibility_ghosting(ranges, previous, at) | expand_flag(cut, ranges.motion.ndim)
-    geometry, texture = geometry_aliasing(ranges, at), texture_aliasing(ranges, at)
-    shading = shading_ghosting(ranges, previous, at, exposure=exposure) & ~(visibility | geometry | texture)
+    visibility = visibility_ghosting(ranges, previous, at=at) | expand_flag(cut, ranges.motion.ndim)
+    geometry, texture = geometry_aliasing(ranges, at=at), texture_aliasing(ranges, at=at)
+    shading = shading_ghosting(ranges, previous, at=at, exposure=exposure) & ~(visibility | geometry | texture)
     return Labels(ghosting=_first(visibility, shading), aliasing=_first(geometry, texture))
 
 
@@ -225,11 +225,11 @@ def _first(*marks: Marks) -> Classes:
 
 
 def label_sequence(
-    ranges: SampleRanges, cut: Flag, at: Thresholds = DEFAULTS, *, exposure: Scalar | float = 1.0
+    ranges: SampleRanges, cut: Flag, *, at: Thresholds = DEFAULTS, exposure: Scalar | float = 1.0
 ) -> Labels:
     """``label`` of every frame of a sequence, frame 0 a cut.
 
     Leaves ``[T, ..., H, W, C]``, ``cut`` and ``exposure`` ``[T, ...]``.
     """
     previous = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), ranges)
-    return label(ranges, previous, jnp.asarray(cut).at[0].set(True), at, exposure=exposure)
+    return label(ranges, previous, jnp.asarray(cut).at[0].set(True), at=at, exposure=exposure)

@@ -61,7 +61,7 @@ def evaluate_classes(
         batch = jax.tree.map(lambda leaf: leaf[:, None], frames)
         kept = unroll(method, variables, batch, every(), keep=keep).aux[SS]
         kept = {name: values[:, 0] for name, values in kept.items()}
-        labels = label_sequence(ranges, frames.cut, thresholds, exposure=kept.pop("exposure"))
+        labels = label_sequence(ranges, frames.cut, at=thresholds, exposure=kept.pop("exposure"))
         return kept, {name: getattr(labels, name)[..., 0] for name in QUESTIONS}
 
     counts: dict[str, dict[str, np.ndarray]] = {}

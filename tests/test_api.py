@@ -1,6 +1,8 @@
 """The public surface: lazy, named once, nothing that is there by accident."""
 
 import ast
+import importlib
+import inspect
 import pkgutil
 import subprocess
 import sys
@@ -82,3 +84,36 @@ def test_no_module_has_the_name_of_what_it_holds():
         if module.startswith("essjax.") and getattr(node, "name", "") == module.rpartition(".")[2]
     ]
     assert not offenders, "put an underscore in front of the module's name"
+
+
+def public():
+    """Dotted name -> what ``essjax`` offers under it: of a package its ``__all__``, of a module what it defines."""
+    for name in essjax.__all__:
+        module = importlib.import_module(f"essjax.{name}")
+        for member in getattr(module, "__all__", sorted(NAMES[module.__name__])):
+            if not member.startswith("_"):
+                yield f"{name}.{member}", getattr(module, member)
+
+
+DATA = {
+    "cameras.pixel_positions": {"jitter"}, "color.demodulation_albedo": {"metallic", "specular"},
+    "data.read_sequence": {"frames"}, "exposure.exposed": {"map_radiance"}, "frames.check_dtypes": {"where"},
+    "frames.check_shapes": {"where"}, "frames.validate_frame": {"where", "requires"},
+    "frames.validate_ranges": {"where"}, "frames.validate_sequence": {"name", "requires"},
+    "networks.extrassnet": {"width", "scale"}, "networks.frnet": {"width"}, "rollout.alternate": {"parity"},
+    "tensors.read_tensors": {"what"}, "train.predict_last": {"schedule"},
+}  # fmt: skip
+"""Arguments with a default that may be given by position: what a function works on, not how."""
+
+
+def test_tunables_are_keyword_only():
+    found = {
+        name: {
+            parameter.name
+            for parameter in inspect.signature(value).parameters.values()
+            if parameter.kind is parameter.POSITIONAL_OR_KEYWORD and parameter.default is not parameter.empty
+        }
+        for name, value in public()
+        if inspect.isfunction(value)
+    }
+    assert {name: arguments for name, arguments in found.items() if arguments} == DATA

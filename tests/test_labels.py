@@ -16,9 +16,9 @@ B, H, W = 2, 11, 17
 AT = Thresholds(ghosting_depth=0.3, ghosting_velocity=4.0, ghosting_color=0.1, ghosting_overlap=0.3, opening=2)
 """Thresholds that noise passes and fails about as often."""
 
-visibility = jax.jit(labels.visibility_ghosting, static_argnums=2)
-shading = jax.jit(labels.shading_ghosting, static_argnums=2)
-label = jax.jit(labels.label, static_argnums=3)
+visibility = jax.jit(labels.visibility_ghosting, static_argnames="at")
+shading = jax.jit(labels.shading_ghosting, static_argnames="at")
+label = jax.jit(labels.label, static_argnames="at")
 
 
 def closeness(depth):
@@ -118,9 +118,9 @@ def each(pair):
 
 
 def test_every_equation_equals_brute_force(pair):
-    found = {"visibility": visibility(*pair, AT), "shading": shading(*pair, AT)}
+    found = {"visibility": visibility(*pair, at=AT), "shading": shading(*pair, at=AT)}
     cut = jnp.zeros(B, bool)
-    both = label(*pair, cut, AT)
+    both = label(*pair, cut, at=AT)
     for b, now, then in each(pair):
         seen, shaded = brute_visibility(now, then), brute_shading(now, then)
         np.testing.assert_array_equal(found["visibility"][b, ..., 0], seen)
@@ -134,13 +134,13 @@ def test_every_equation_equals_brute_force(pair):
 
 
 def test_a_cut_is_visibility_ghosting_everywhere(pair):
-    both = label(*pair, jnp.array([False, True]), AT)
+    both = label(*pair, jnp.array([False, True]), at=AT)
     assert (both.ghosting[1] == GHOSTING.index("visibility")).all() and (both.ghosting[0] != 0).any()
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), pair[1], pair[0], pair[1])
     cut = jnp.zeros((3, B), bool).at[2, 1].set(True)
-    sequence = jax.jit(labels.label_sequence, static_argnums=2)(stacked, cut, AT)
+    sequence = jax.jit(labels.label_sequence, static_argnames="at")(stacked, cut, at=AT)
     assert (sequence.ghosting[0] == 0).all() and (sequence.ghosting[2, 1] == 0).all()
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1], b), sequence, label(pair[0], pair[1], cut[1], AT))
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1], b), sequence, label(pair[0], pair[1], cut[1], at=AT))
     assert (sequence.ghosting[2, 0] != 0).any()
 
 
@@ -176,7 +176,7 @@ def draw(classes, names) -> list[str]:
 def test_a_box_that_moves_uncovers_the_wall_behind_it():
     """It moves three pixels to the right: columns 4 to 6 show the wall again."""
     now, then = SampleRanges(**with_box(7, -3.0)), SampleRanges(**with_box(4, -3.0))
-    both = label(now, then, jnp.asarray(False), Thresholds())
+    both = label(now, then, jnp.asarray(False), at=Thresholds())
     rows = draw(both.ghosting, GHOSTING)
     assert rows[3:8] == ["....vvv.........."] * 5
     assert rows[:3] + rows[8:] == ["." * W] * 6
@@ -186,7 +186,7 @@ def test_a_box_that_moves_uncovers_the_wall_behind_it():
 def test_a_slow_box_and_one_that_rests_leave_history_alone():
     for left, motion in ((5, -1.0), (4, 0.0)):  # eq 2: one pixel is not more than one squared pixel
         now, then = SampleRanges(**with_box(left, motion)), SampleRanges(**with_box(4, motion))
-        assert draw(label(now, then, jnp.asarray(False), Thresholds()).ghosting, GHOSTING) == ["." * W] * H
+        assert draw(label(now, then, jnp.asarray(False), at=Thresholds()).ghosting, GHOSTING) == ["." * W] * H
 
 
 def test_a_light_that_goes_on_is_shading_ghosting_but_texture_is_not():
@@ -195,32 +195,32 @@ def test_a_light_that_goes_on_is_shading_ghosting_but_texture_is_not():
         images["color_min"][2:9, 3:12], images["color_max"][2:9, 3:12] = value, value
     now["color_min"][5, 7] = 0.1  # a detail: aliasing, and no shading ghosting
     now["color_max"][0, 16] = 0.9  # a lone pixel at the corner
-    both = label(SampleRanges(**now), SampleRanges(**then), jnp.asarray(False), Thresholds())
+    both = label(SampleRanges(**now), SampleRanges(**then), jnp.asarray(False), at=Thresholds())
     rows = draw(both.ghosting, GHOSTING)
     assert rows[2:5] + rows[6:9] == ["...sssssssss....."] * 6 and rows[5] == "...ssss.ssss....."
     assert rows[:2] + rows[9:] == ["." * W] * 4
     assert draw(both.aliasing, ALIASING)[5] == ".......t........."
     # The same change with history whose box overlaps: spatial detail, not light.
     then["color_max"][2:9, 3:12] = 0.85
-    both = label(SampleRanges(**now), SampleRanges(**then), jnp.asarray(False), Thresholds(ghosting_overlap=0.01))
+    both = label(SampleRanges(**now), SampleRanges(**then), jnp.asarray(False), at=Thresholds(ghosting_overlap=0.01))
     assert draw(both.ghosting, GHOSTING) == ["." * W] * H
 
 
 def test_what_comes_from_outside_has_no_history():
     now = plain()
     now["motion"][..., 0] = -2.0
-    both = label(SampleRanges(**now), SampleRanges(**now), jnp.asarray(False), Thresholds())
+    both = label(SampleRanges(**now), SampleRanges(**now), jnp.asarray(False), at=Thresholds())
     assert draw(both.ghosting, GHOSTING) == ["vv" + "." * (W - 2)] * H
 
 
 @pytest.mark.parametrize("size", [2, 3, 5])
 def test_opening_keeps_squares(size):
     marks = np.random.default_rng(size).uniform(size=(B, H, W, 1)) < [0.0, 0.0, 0.6, 0.8, 0.0, 0.92][size]
-    opened = np.asarray(labels.opening(jnp.asarray(marks), size))
+    opened = np.asarray(labels.opening(jnp.asarray(marks), size=size))
     for b in range(B):
         np.testing.assert_array_equal(opened[b, ..., 0], brute_opening(marks[b, ..., 0], size))
     assert 0.05 < opened.mean() < marks.mean()
-    np.testing.assert_array_equal(labels.opening(jnp.asarray(opened), size), opened)  # twice is once
+    np.testing.assert_array_equal(labels.opening(jnp.asarray(opened), size=size), opened)  # twice is once
 
 
 def test_thresholds_of_other_heights():

@@ -198,7 +198,7 @@ def _inverse_sigmoid(share: Array) -> Array:
 
 @registered
 def classifier(
-    scale: int = 2, *, width: int = 32, composition_width: int = 64, alpha: float = 0.5, sigma: float = 0.8
+    *, scale: int = 2, width: int = 32, composition_width: int = 64, alpha: float = 0.5, sigma: float = 0.8
 ) -> Method:
     """Classifier-guided supersampling of a sequence whose frames are all rendered.
 
@@ -214,7 +214,7 @@ def classifier(
       alpha: smallest share of a sample on its own output pixel, before training.
       sigma: of the Gaussian that says how near a sample is, output pixels.
     """
-    network, composition = classifier_network(width, prior=PRIOR), composition_network(composition_width)
+    network, composition = classifier_network(width=width, prior=PRIOR), composition_network(width=composition_width)
 
     def start(example: Frame) -> History:
         *lead, height, low_width, _ = example.motion.shape

@@ -87,8 +87,8 @@ def _name(reprojection: str, dilate: bool, accumulation: bool) -> str:
 
 @registered
 def dlctus(
-    scale: int = 2,
     *,
+    scale: int = 2,
     reprojection: str = "bicubic-0.75",
     dilate: bool = False,
     accumulation: bool = True,

@@ -261,7 +261,7 @@ def fasset(
     if not scale > 0:
         raise ValueError(f"scale: expected a positive number, got {scale!r}.")
     hidden = width * 16 // 3 if hidden is None else hidden
-    network = networks.fasset(scale, width=width, hidden=hidden, gencoder=gencoder, shared=shared)
+    network = networks.fasset(scale=scale, width=width, hidden=hidden, gencoder=gencoder, shared=shared)
     removed = {"no-gencoder": not gencoder, "no-mask": not mask_rendered, "no-sharing": not shared}
     name = "-".join(["fasset", *(part for part, absent in removed.items() if absent)])
 

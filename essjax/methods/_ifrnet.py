@@ -25,7 +25,7 @@ def ifrnet(*, width: int = 24) -> Method:
     Args:
       width: of the network; 24 is the published small model, 32 the standard one.
     """
-    network = ifrnet_network(width)
+    network = ifrnet_network(width=width)
 
     def init(key, example):
         *lead, height, wide, _ = example.motion.shape

@@ -54,7 +54,7 @@ def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
 
 
 @registered
-def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool = False) -> Method:
+def nsrr(*, scale: int = 2, width: int = 32, residual: bool = True, half: bool = False) -> Method:
     """Neural supersampling of a sequence that is rendered in every frame.
 
     ``variables = {"nsrr": ...}``. ``aux``: ``display_image``, the output before it is clipped to [0, 1] (x / (1 + x),
@@ -68,7 +68,7 @@ def nsrr(scale: int = 2, *, width: int = 32, residual: bool = True, half: bool =
       half: for sequences of which some frames are not rendered. ``extrapolate_step`` then follows the motion only and
         shows black; a colour that another method made for the frame is supersampled, but never looked back at.
     """
-    network = nsrr_network(width)
+    network = nsrr_network(width=width)
 
     def start(example: Frame) -> History:
         content = jnp.zeros((*example.motion.shape[:-1], FEATURES), jnp.float32)

@@ -184,8 +184,8 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
 
 @registered
 def taau(
-    scale: int = 2,
     *,
+    scale: int = 2,
     alpha: float = 0.7,
     sigma: float = 0.8,
     clamp: str = "ycocg",
@@ -230,8 +230,8 @@ def taau(
 
 @registered
 def taau_half(
-    scale: int = 2,
     *,
+    scale: int = 2,
     alpha: float = 0.7,
     sigma: float = 0.8,
     clamp: str = "ycocg",
@@ -268,7 +268,7 @@ def taa(
 
 
 @registered
-def tus(scale: int = 2, *, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
+def tus(*, scale: int = 2, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
     """The TUS row of thesis 002 (section 5.3.1): history clamping, bicubic reprojection (a = -0.75), no dilation.
 
     Constant α, and history that is started and padded with the jitter-aligned upsampled frame, as in ``dlctus``. Our

@@ -15,7 +15,7 @@ from essjax.typing import Array, Callable, Image, PyTree
 from essjax.warp import backward_warp, compose_motion, jitter_aligned_upsample, jittered_motion
 
 
-def jau_image(frame: Frame, scale: float, mode: str = "bilinear") -> Array:
+def jau_image(frame: Frame, scale: float, *, mode: str = "bilinear") -> Array:
     """The frame's colour upsampled from where its samples lie (JAU, SPEC 4), ``[..., scale H, scale W, 3]``.
 
     Inside x / (1 + x): a highlight then does not bleed over its neighbours and bicubic kernels hardly ring. It is the
@@ -51,7 +51,7 @@ def _without_jitter(frame: Frame) -> Frame:
 
 
 @registered
-def bilinear(scale: float = 2) -> Method:
+def bilinear(*, scale: float = 2) -> Method:
     """Bilinear upscaling of each rendered frame in x / (1 + x); like a plain upscaler it ignores the jitter.
 
     Frames without colour repeat the last image and are not scored.
@@ -59,21 +59,21 @@ def bilinear(scale: float = 2) -> Method:
     Args:
       scale: output size over input size.
     """
-    return _spatial("bilinear", scale, lambda frame: jau_image(_without_jitter(frame), scale, "bilinear"))
+    return _spatial("bilinear", scale, lambda frame: jau_image(_without_jitter(frame), scale))
 
 
 @registered
-def bicubic(scale: float = 2) -> Method:
+def bicubic(*, scale: float = 2) -> Method:
     """Bicubic (a = -0.5) upscaling of each rendered frame on x / (1 + x); ignores the jitter. See ``bilinear``.
 
     Args:
       scale: output size over input size.
     """
-    return _spatial("bicubic", scale, lambda frame: jau_image(_without_jitter(frame), scale, "bicubic"))
+    return _spatial("bicubic", scale, lambda frame: jau_image(_without_jitter(frame), scale, mode="bicubic"))
 
 
 @registered
-def jau(scale: float = 2, *, mode: str = "bilinear") -> Method:
+def jau(*, scale: float = 2, mode: str = "bilinear") -> Method:
     """Jitter-aligned upsampling of each rendered frame: it reads where the samples really lie. See ``bilinear``.
 
     Args:
@@ -81,7 +81,7 @@ def jau(scale: float = 2, *, mode: str = "bilinear") -> Method:
       mode: "nearest", "bilinear", "bicubic" or "bicubic-0.75"; not bilinear is named ``jau-<mode>``.
     """
     name = "jau" if mode == "bilinear" else f"jau-{mode}"
-    return _spatial(name, scale, lambda frame: jau_image(frame, scale, mode))
+    return _spatial(name, scale, lambda frame: jau_image(frame, scale, mode=mode))
 
 
 def gaussian_blur(image: Image, std: float) -> Array:

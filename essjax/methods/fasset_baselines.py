@@ -56,7 +56,7 @@ def enlarge(frame: Frame, scale: int, color: Color | None) -> Frame:
 
 
 @registered
-def extranet_nsrr(scale: int = 2, *, width: int = 32) -> Method:
+def extranet_nsrr(*, scale: int = 2, width: int = 32) -> Method:
     """ExtraNet, then NSRR on every frame. ``variables = {"extranet", "nsrr"}``, trained separately.
 
     NSRR looks back at rendered frames only, so that supersampled frames are those of ``nsrr_extranet``, as in Table 2.
@@ -65,11 +65,11 @@ def extranet_nsrr(scale: int = 2, *, width: int = 32) -> Method:
       scale: whole number.
       width: of NSRR.
     """
-    return composed("extranet+nsrr", extranet(), nsrr(scale, width=width, half=True), extrapolates=True)
+    return composed("extranet+nsrr", extranet(), nsrr(scale=scale, width=width, half=True), extrapolates=True)
 
 
 @registered
-def nsrr_extranet(scale: int = 2, *, width: int = 32) -> Method:
+def nsrr_extranet(*, scale: int = 2, width: int = 32) -> Method:
     """NSRR on rendered frames, then ExtraNet at output size on upsampled G-buffers. The variables of ``extranet_nsrr``.
 
     Args:
@@ -80,7 +80,7 @@ def nsrr_extranet(scale: int = 2, *, width: int = 32) -> Method:
     def between(frame: Frame, image: Color) -> Frame:
         return enlarge(frame, scale, None if frame.color is None else image)
 
-    first = nsrr(scale, width=width, half=True)
+    first = nsrr(scale=scale, width=width, half=True)
     return composed("nsrr+extranet", first, extranet(), extrapolates=True, between=between)
 
 
@@ -101,7 +101,7 @@ def _without_gaps(seen: Inputs) -> Inputs:
 
 
 @registered
-def extranet_plus(scale: int = 2) -> Method:
+def extranet_plus(*, scale: int = 2) -> Method:
     """ExtraNet+: ExtraNet at output size on zero-upsampled frames; it fills what was disoccluded and what lies between.
 
     ``variables = {"extranet_plus": {"params", "batch_stats"}}``; ``aux`` of an extrapolated step as of ``extranet``, at

@@ -241,7 +241,7 @@ class FASSET(nn.Module):
 
 
 def fasset(
-    scale: float = 2, *, width: int = 24, hidden: int = 128, gencoder: bool = True, shared: bool = True
+    *, scale: float = 2, width: int = 24, hidden: int = 128, gencoder: bool = True, shared: bool = True
 ) -> Network:
     """FASSET as a ``Network``; choose the task with ``apply(..., method="render" | "extrapolate")``.
 

@@ -146,6 +146,6 @@ class IFRNet(nn.Module):
         }
 
 
-def ifrnet(width: int = 24) -> Network:
+def ifrnet(*, width: int = 24) -> Network:
     """IFRNet as a ``Network``; ``apply(..., method="encode")`` gives the encoder's features of images."""
     return from_linen(IFRNet(width))

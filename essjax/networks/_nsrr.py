@@ -101,6 +101,6 @@ class NSRR(nn.Module):
         return self.current(rgbd), self.previous(rgbd), self.reconstruct(current, previous)
 
 
-def nsrr(width: int = 32) -> Network:
+def nsrr(*, width: int = 32) -> Network:
     """NSRR as a ``Network``."""
     return from_linen(NSRR(width))

@@ -101,7 +101,7 @@ class Composition(nn.Module):
         return zero_conv(1, 1)(x)
 
 
-def classifier_network(width: int = 32, *, prior: Sequence[float] = (0.0,) * LOGITS) -> Network:
+def classifier_network(*, width: int = 32, prior: Sequence[float] = (0.0,) * LOGITS) -> Network:
     """``apply(variables, inputs, train) -> (logits, state)``, at the output's resolution; see ``Classifier``.
 
     Args:
@@ -118,6 +118,6 @@ def classifier_network(width: int = 32, *, prior: Sequence[float] = (0.0,) * LOG
     return from_linen(Classifier(width, tuple(prior)))
 
 
-def composition_network(width: int = 64) -> Network:
+def composition_network(*, width: int = 64) -> Network:
     """``apply(variables, inputs, train) -> (logit, state)``; see ``Composition``. 64 in the paper."""
     return from_linen(Composition(width))

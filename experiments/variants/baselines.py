@@ -8,22 +8,22 @@ VARIANTS = {
     "warp-blur": Variant(
         "the same of a frame blurred by 0.5 px: what denoising alone is worth", lambda c: methods.warp(blur=0.5)
     ),
-    "bilinear": Variant("bilinear upscaling of each rendered frame", lambda c: methods.bilinear(c.scale)),
-    "bicubic": Variant("bicubic upscaling of each rendered frame", lambda c: methods.bicubic(c.scale)),
-    "jau": Variant("jitter-aligned bilinear upscaling", lambda c: methods.jau(c.scale)),
-    "jau-bicubic": Variant("jitter-aligned bicubic upscaling", lambda c: methods.jau(c.scale, mode="bicubic")),
+    "bilinear": Variant("bilinear upscaling of each rendered frame", lambda c: methods.bilinear(scale=c.scale)),
+    "bicubic": Variant("bicubic upscaling of each rendered frame", lambda c: methods.bicubic(scale=c.scale)),
+    "jau": Variant("jitter-aligned bilinear upscaling", lambda c: methods.jau(scale=c.scale)),
+    "jau-bicubic": Variant("jitter-aligned bicubic upscaling", lambda c: methods.jau(scale=c.scale, mode="bicubic")),
     "tus": Variant(
         "temporal upsampling with the settings of the DLCTUS thesis, every frame rendered",
-        lambda c: methods.tus(c.scale),
+        lambda c: methods.tus(scale=c.scale),
     ),
     "taau": Variant(
         "temporal anti-aliasing with upsampling on every frame (twice the input)",
-        lambda c, **settings: methods.taau(c.scale, **settings),
+        lambda c, **settings: methods.taau(scale=c.scale, **settings),
         tuned=True,
     ),
     "taau-half": Variant(
         "the same on rendered frames, its output warped in between",
-        lambda c, **settings: methods.taau_half(c.scale, **settings),
+        lambda c, **settings: methods.taau_half(scale=c.scale, **settings),
         tuned=True,
     ),
     "taa": Variant(

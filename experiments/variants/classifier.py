@@ -14,7 +14,7 @@ def thresholds(config: Config) -> Thresholds:
 
 
 def _classifier(config: Config) -> Method:
-    return methods.classifier(config.scale, width=config.first_width, composition_width=config.width)
+    return methods.classifier(scale=config.scale, width=config.first_width, composition_width=config.width)
 
 
 def _classification(config: Config) -> Stage:

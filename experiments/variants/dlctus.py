@@ -18,7 +18,7 @@ CROPS = {"paper": 256}
 
 
 def _stage(config: Config, theta: float | None, options: dict[str, Any]) -> Stage:
-    method = methods.dlctus(config.scale, **options)
+    method = methods.dlctus(scale=config.scale, **options)
     objective = dlctus_objective(method, theta=theta)
     return Stage("dlctus", method, objective, config.batch, config.learning_rate, main_budget(config))
 
@@ -26,7 +26,7 @@ def _stage(config: Config, theta: float | None, options: dict[str, Any]) -> Stag
 def _trained(summary: str, *, theta: float | None = None, **options: Any) -> Variant:
     return Variant(
         summary,
-        lambda config: methods.dlctus(config.scale, **options),
+        lambda config: methods.dlctus(scale=config.scale, **options),
         lambda config: [_stage(config, theta, options)],
         presets=PRESETS,
         crops=CROPS,
@@ -34,7 +34,7 @@ def _trained(summary: str, *, theta: float | None = None, **options: Any) -> Var
 
 
 def _at_test_time(summary: str, **options: Any) -> Variant:
-    return Variant(summary, lambda config: methods.dlctus(config.scale, **options), weights="dlctus")
+    return Variant(summary, lambda config: methods.dlctus(scale=config.scale, **options), weights="dlctus")
 
 
 VARIANTS = {

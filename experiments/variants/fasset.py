@@ -56,7 +56,7 @@ TWO_STAGE_PRESETS = {
 
 
 def _extranet_nsrr(config: Config) -> Method:
-    return methods.extranet_nsrr(config.scale, width=config.width)
+    return methods.extranet_nsrr(scale=config.scale, width=config.width)
 
 
 def _two_stages(config: Config) -> list[Stage]:
@@ -74,7 +74,7 @@ def _two_stages(config: Config) -> list[Stage]:
 
 
 def _plus_stage(config: Config) -> list[Stage]:
-    stage = extranet_stage(config, methods.extranet_plus(config.scale), target_shading=reference_shading)
+    stage = extranet_stage(config, methods.extranet_plus(scale=config.scale), target_shading=reference_shading)
     return [dataclasses.replace(stage, name="extranet_plus")]
 
 
@@ -92,12 +92,12 @@ VARIANTS = {
     ),
     "nsrr+extranet": Variant(
         "NSRR on rendered frames, then ExtraNet at output resolution with upsampled G-buffers",
-        lambda config: methods.nsrr_extranet(config.scale, width=config.width),
+        lambda config: methods.nsrr_extranet(scale=config.scale, width=config.width),
         weights="extranet+nsrr",
     ),
     "extranet-plus": Variant(
         "ExtraNet at output resolution on zero-upsampled frames",
-        lambda config: methods.extranet_plus(config.scale),
+        lambda config: methods.extranet_plus(scale=config.scale),
         _plus_stage,
         presets={**EXTRANET_PRESETS, "quick": {**EXTRANET_PRESETS["quick"], "batch": 2}},
     ),

@@ -10,7 +10,7 @@ from experiments.variants.base import Stage, Variant, main_budget
 
 
 def _nsrr(config: Config, *, half: bool = False) -> Method:
-    return methods.nsrr(config.scale, width=config.width, half=half)
+    return methods.nsrr(scale=config.scale, width=config.width, half=half)
 
 
 def nsrr_stage(config: Config, *, half: bool = False, within: Method | None = None) -> Stage:

@@ -59,7 +59,7 @@ def oracle(shift):
 def test_scored_frames_are_compared():
     clips = [clip("a", 0)]
     sequence = clips[0].sequence
-    labels = jax.device_get(label_sequence(sequence.ranges, jnp.asarray(sequence.frames.cut), AT))
+    labels = jax.device_get(label_sequence(sequence.ranges, jnp.asarray(sequence.frames.cut), at=AT))
     known = jnp.asarray(labels.ghosting[..., 0])
     scores, maps = evaluate_classes(oracle(0), known, clips, AT)
     assert set(scores) == {"all", "a"} and scores["all"] == scores["a"]

@@ -60,7 +60,7 @@ def test_the_clamps_are_tried_side_by_side(monkeypatch):
 
 
 def test_settings_side_by_side_are_what_each_gives_alone():
-    method = methods.taau(2)
+    method = methods.taau(scale=2)
     frames = make_frames(2, T=3, B=1, H=6, W=8)
     settings = [tuning.Setting("ycocg", alpha, sigma, 0.0) for alpha, sigma in ((0.2, 0.5), (0.7, 0.9))]
     alone = [streamed(method, tuning.setting_variables(setting), frames, (SS,) * 3) for setting in settings]

@@ -45,7 +45,7 @@ def test_of_many_clips_a_few_are_played(dataset):
     assert len(windows(many, make_config("smoke", ["warmup=2"]), native=False)) == CLIPS < 15
 
 
-@pytest.mark.parametrize("method", [methods.bilinear(2), methods.warp(), methods.taau(2)], ids=lambda m: m.info.name)
+@pytest.mark.parametrize("method", [methods.bilinear(), methods.warp(), methods.taau()], ids=lambda m: m.info.name)
 def test_scores_are_those_of_the_evaluation(dataset, method):
     """Of the first clip, whose window is what evaluation plays from the start: the same frames give the same PSNR."""
     config = make_config("smoke", ["warmup=5"])

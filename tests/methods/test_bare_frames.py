@@ -75,7 +75,7 @@ def test_a_comparison_leaves_out_what_lacks_a_buffer_and_says_so():
     poor = dataclasses.replace(sequence, frames=bare(sequence.frames))
     assert comparison.unfit(methods.extrass_w(), sequence) == ""
     assert comparison.unfit(methods.extrass_w(), poor) == "this dataset has no base_color, normal"
-    assert comparison.unfit(methods.taau(2), poor) == ""
+    assert comparison.unfit(methods.taau(scale=2), poor) == ""
     config, holes = make_config("smoke", []), np.zeros((3, 12, 18, 1))
     asked = ["bilinear", "extranet+taa"]
     remarks = {
@@ -90,7 +90,7 @@ def test_a_comparison_leaves_out_what_lacks_a_buffer_and_says_so():
 
 def test_a_comparison_leaves_out_upscalers_where_the_reference_is_not_larger():
     sequence = jax.tree.map(lambda leaf: leaf[:, 0], make_sequence(0, T=2, B=1, scale=1))
-    assert comparison.unfit(methods.bilinear(2), sequence) == (
+    assert comparison.unfit(methods.bilinear(scale=2), sequence) == (
         "it enlarges 2 times, this dataset's reference is 1 times larger"
     )
     assert comparison.unfit(methods.warp(), sequence) == ""

@@ -336,7 +336,7 @@ def test_errors():
     with pytest.raises(ValueError, match="clamp: expected one of none, rgb, ycocg, got 'hsv'"):
         methods.taau(clamp="hsv")
     with pytest.raises(ValueError, match="scale: expected a whole number >= 1, got 1.5"):
-        methods.taau(1.5)
+        methods.taau(scale=1.5)
     with pytest.raises(ValueError, match="expected 0 < alpha <= 1 and sigma > 0, got alpha = 2"):
         methods.taau_half(alpha=2)
     frames = random_frames()

@@ -238,7 +238,7 @@ def test_history_ends_at_a_cut(busy):
 def test_before_training_it_accumulates(untrained):
     scene = wall(10, B, H, W)
     images = stream(untrained, bare(scene.frames))
-    alone = jax.jit(lambda frames: unroll(jau(2, mode="bicubic"), {}, frames, every()).image)(scene.frames)
+    alone = jax.jit(lambda frames: unroll(jau(scale=2, mode="bicubic"), {}, frames, every()).image)(scene.frames)
     inside = (Ellipsis, slice(4, -4), slice(4, -4), slice(None))
     error = lambda image: np.square(display(image)[inside] - display(scene.reference)[inside]).mean(axis=(2, 3, 4))
     gain = 10 * np.log10(error(alone) / error(images))  # [T, B]

@@ -100,7 +100,7 @@ def test_with_taa_it_has_the_variables_of_the_first(first):
 
 def test_taa_needs_frames_of_one_size():
     with pytest.raises(ValueError, match="with_taa: expected a method of scale 1, got jau of 2"):
-        with_taa(jau(2))
+        with_taa(jau(scale=2))
 
 
 def test_settled_needs_no_variables():

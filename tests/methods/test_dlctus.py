@@ -47,7 +47,7 @@ def compiled(method):
     return jax.jit(lambda variables, frames: unroll(method, variables, frames, every(), keep=keep))
 
 
-METHOD, JAU = dlctus(2), methods.jau(2)
+METHOD, JAU = dlctus(scale=2), methods.jau(scale=2)
 VARIABLES = busy_variables(METHOD)
 
 
@@ -147,7 +147,7 @@ def test_upsampling_agrees_with_the_listing(scale, jitter):
 
 @pytest.mark.parametrize(("scale", "accumulation"), [(2, True), (4, True), (2, False)])
 def test_two_steps_agree_with_the_listing(scale, accumulation):
-    method = dlctus(scale, accumulation=accumulation)
+    method = dlctus(scale=scale, accumulation=accumulation)
     variables = busy_variables(method)
     frames = make_frames(7, T=2, B=1, H=5 if scale == 2 else 3, W=7 if scale == 2 else 4)
     frames = jax.tree.map(lambda leaf: leaf[:, 0], frames)  # no batch axis: every leading axis will do
@@ -173,8 +173,8 @@ def test_number_of_parameters(scale):
     count = lambda method: sum(
         math.prod(leaf.shape) for leaf in jax.tree.leaves(jax.eval_shape(method.init, jax.random.key(0), example))
     )
-    assert count(dlctus(scale)) == 78_112
-    assert count(dlctus(scale, accumulation=False)) == 78_112 - 4 * 4 * 32
+    assert count(dlctus(scale=scale)) == 78_112
+    assert count(dlctus(scale=scale, accumulation=False)) == 78_112 - 4 * 4 * 32
 
 
 def test_untrained_outputs_lie_inside_the_clamp():
@@ -263,7 +263,7 @@ def test_batch_elements_are_independent():
 
 def test_test_time_variations_share_the_variables():
     frames = random_frames(6)
-    plain, varied = (reinhard(run(frames, m).image) for m in (METHOD, dlctus(2, reprojection="5-tap", dilate=True)))
+    plain, varied = (reinhard(run(frames, m).image) for m in (METHOD, dlctus(reprojection="5-tap", dilate=True)))
     np.testing.assert_allclose(varied[0], plain[0], atol=1e-6)
     assert 1e-3 < float(jnp.abs(varied[1:] - plain[1:]).max()) < 1.0
 
@@ -282,13 +282,13 @@ def test_names_and_kinds():
     settings += [{"dilate": True}, {"accumulation": False}, {"dilate": True, "reprojection": "bilinear"}]
     names = ["dlctus", "dlctus-bilinear", "dlctus-5tap", "dlctus-9tap", "dlctus-dilated", "dlctus-no-accumulation"]
     assert [dlctus(**s).info.name for s in settings] == [*names, "dlctus-dilated-bilinear"]
-    info = dlctus(4).info
+    info = dlctus(scale=4).info
     assert (info.scale, info.predicts, info.renders_all) == (4, {"ss"}, True)
 
 
 def test_errors():
     with pytest.raises(ValueError, match="scale: expected 2 or 4, got 3"):
-        dlctus(3)
+        dlctus(scale=3)
     with pytest.raises(ValueError, match="reprojection: expected one of bicubic-0.75, bilinear, 5-tap, 9-tap, got 'x'"):
         dlctus(reprojection="x")
     with pytest.raises(ValueError, match="expected 0 <= near < far, got near = 3 and far = 2"):

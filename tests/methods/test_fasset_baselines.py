@@ -50,7 +50,7 @@ def test_enlarged_frames_read_buffers_where_their_samples_lie():
 @pytest.fixture(scope="module")
 def halved():
     """NSRR on half of the frames: its steps on each kind of frame (an extrapolated one bare, or with a made colour)."""
-    method = nsrr(2, width=4, half=True)
+    method = nsrr(scale=2, width=4, half=True)
     frames = make_frames(2, T=T, B=B, H=H, W=W)
     shapes = jax.eval_shape(method.init, jax.random.key(0), select_time(frames, 0))
     rng = np.random.default_rng(0)

@@ -18,7 +18,7 @@ from essjax.rollout import alternate, every, unroll
 from tests.helpers import make_frames, random_image, streamed
 
 T, B, H, W = 7, 2, 9, 13
-METHOD = nsrr(2, width=4)
+METHOD = nsrr(scale=2, width=4)
 
 
 def frames_of(seed, length=T):
@@ -44,7 +44,7 @@ def rollout():
 
 def test_untrained_it_is_the_upsampled_frame(untrained):
     frames = frames_of(1)
-    expected = unroll(jau(2), {}, frames, every()).image
+    expected = unroll(jau(scale=2), {}, frames, every()).image
     np.testing.assert_allclose(rollout()(untrained, frames).image, expected, rtol=2e-3, atol=1e-4)
 
 

@@ -63,7 +63,7 @@ def accumulated(scale, rate_of):
 
 def test_tent_with_alpha_1_at_4x4_collects_every_sample_once():
     frames, expected = accumulated(4, lambda seen: 1.0)
-    got = run(methods.taau(4, alpha=1.0, accumulation="constant", **ENDLESS), frames)[-1]
+    got = run(methods.taau(scale=4, alpha=1.0, accumulation="constant", **ENDLESS), frames)[-1]
     np.testing.assert_allclose(got, expected, atol=1e-4)
     x, y = np.meshgrid((np.arange(4 * W) + 0.5) / 4, (np.arange(4 * H) + 0.5) / 4)
     away = np.ones((4 * H, 4 * W), bool)
@@ -74,7 +74,7 @@ def test_tent_with_alpha_1_at_4x4_collects_every_sample_once():
 def test_average_of_the_samples_in_a_pixel():
     """1 / N; the upsampled colour that came first counts next to nothing where no sample was."""
     frames, expected = accumulated(2, lambda seen: 1.0 / seen)
-    got = run(methods.taau(2, accumulation="average", **ENDLESS), frames)[-1]
+    got = run(methods.taau(scale=2, accumulation="average", **ENDLESS), frames)[-1]
     np.testing.assert_allclose(got, expected, atol=2 * UPSAMPLED_WEIGHT)
 
 
@@ -137,7 +137,7 @@ def test_clipped_history_lies_in_the_box_of_its_space():
     frames = dataclasses.replace(frames, color=frames.color.at[1].multiply(0.1), jitter=jnp.zeros_like(frames.jitter))
     settings = {"alpha": 1e-6, "clamp": "ycocg", "accumulation": "constant"}
     clipped, clamped = (
-        np.asarray(rgb_to_ycocg(run(methods.taau(1, rectification=name, **settings), frames)[1]))
+        np.asarray(rgb_to_ycocg(run(methods.taau(scale=1, rectification=name, **settings), frames)[1]))
         for name in ("clip", "clamp")
     )
     padded = np.pad(np.asarray(rgb_to_ycocg(reinhard(frames.color[1]))), ((1, 1), (1, 1), (0, 0)), mode="edge")
@@ -151,10 +151,10 @@ def test_clipped_history_lies_in_the_box_of_its_space():
 
 
 def test_info_and_errors():
-    info = methods.tus(4).info
+    info = methods.tus(scale=4).info
     assert (info.name, info.scale, info.predicts, info.renders_all) == ("tus", 4, {"ss"}, True)
     example = jax.tree.map(lambda leaf: leaf[0], still(2, 1)[1])
-    alphas = [float(methods.tus(scale).init(jax.random.key(0), example)["alpha"]) for scale in (2, 4)]
+    alphas = [float(methods.tus(scale=scale).init(jax.random.key(0), example)["alpha"]) for scale in (2, 4)]
     assert alphas == [0.5, 1.0]  # section 5.3.1
     with pytest.raises(ValueError, match="kernel: expected one of gaussian, tent, got 'box'"):
         methods.taau(kernel="box")

@@ -15,7 +15,7 @@ from essjax.frames import example_frame
 from essjax.interfaces import Method
 from essjax.methods import registry, weights
 
-SMALL = methods.taau(3, alpha=0.25)
+SMALL = methods.taau(scale=3, alpha=0.25)
 
 
 def filled(method, seed=0):

@@ -28,7 +28,7 @@ def busy(variables, seed=0):
 
 @pytest.fixture(scope="module")
 def network():
-    made = classifier_network(WIDTH, prior=PRIOR)
+    made = classifier_network(width=WIDTH, prior=PRIOR)
     return made, made.init(jax.random.key(0), jax.ShapeDtypeStruct((1, 16, 16, CHANNELS), jnp.float32))
 
 
@@ -125,7 +125,7 @@ def test_size_at_the_papers_width():
 
 
 def test_the_composition_network_equals_numpy_and_starts_at_zero():
-    made = composition_network(16)
+    made = composition_network(width=16)
     image = random_image(3, 2, 5, 7, 4)
     variables = made.init(jax.random.key(1), image)
     np.testing.assert_array_equal(made.apply(variables, image)[0], 0.0)
@@ -138,6 +138,6 @@ def test_the_composition_network_equals_numpy_and_starts_at_zero():
 
 def test_errors():
     with pytest.raises(ValueError, match="classifier width: expected a multiple of 8 .*, got 12"):
-        classifier_network(12)
+        classifier_network(width=12)
     with pytest.raises(ValueError, match="prior: expected 6 logits, got 3"):
-        classifier_network(8, prior=(0.0, 1.0, 2.0))
+        classifier_network(width=8, prior=(0.0, 1.0, 2.0))

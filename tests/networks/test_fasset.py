@@ -94,7 +94,7 @@ def test_feature_weights_start_in_the_middle_of_their_range():
 
 @pytest.fixture(scope="module")
 def tiny():
-    network = fasset(1.5, width=4, hidden=5, shared=False)
+    network = fasset(scale=1.5, width=4, hidden=5, shared=False)
     variables = network.init(jax.random.key(0), *inputs(2, 9, 14, 4))
     run = {m: jax.jit(lambda v, *x, m=m: network.apply(v, *x, method=m)[0]) for m in ("render", "extrapolate")}
     return run, variables
@@ -119,7 +119,7 @@ def test_every_input_and_every_task_has_its_say(tiny):
 
 
 def test_statistics_are_the_batchs_in_training():
-    network, given = fasset(1.5, width=4, hidden=5), inputs(2, 9, 14, 4)
+    network, given = fasset(scale=1.5, width=4, hidden=5), inputs(2, 9, 14, 4)
     variables = jax.tree.map(jnp.ones_like, jax.eval_shape(network.init, jax.random.key(0), *given))
     apply = lambda v, *x: network.apply(v, *x, train=True, method="extrapolate")[1]  # noqa: E731
     state = jax.jit(apply)(variables, *given)["batch_stats"]
@@ -138,7 +138,7 @@ ALIGNED = [
 
 @functools.cache
 def outputs_at(scale):
-    network = fasset(scale, width=4, hidden=5)
+    network = fasset(scale=scale, width=4, hidden=5)
     return jax.jit(lambda variables, *x: network.apply(variables, *x, method="render")[0][0])
 
 

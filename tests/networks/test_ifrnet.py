@@ -42,7 +42,7 @@ def test_layers_are_the_published_ones():
 
 def test_untrained_it_reads_both_images_at_the_wanted_samples():
     """A ramp sampled with three jitters, at an odd size: bilinear reads are exact, so their mean is the third image."""
-    height, width, network = 19, 26, ifrnet(8)
+    height, width, network = 19, 26, ifrnet(width=8)
     variables = network.init(jax.random.key(0), *shapes(2, height=height, wide=width))
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     jitter = np.array([[[0.3, -0.4], [0.1, 0.2]], [[-0.2, 0.25], [0.45, -0.1]], [[0.05, 0.4], [-0.3, 0.3]]])

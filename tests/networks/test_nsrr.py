@@ -31,7 +31,7 @@ def test_layers_are_the_published_ones():
 
 @pytest.fixture(scope="module")
 def small():
-    network = nsrr(4)
+    network = nsrr(width=4)
     return network, network.init(jax.random.key(0), *shapes(4, 2, height=5, wide=7))
 
 

@@ -62,7 +62,7 @@ def test_classification(clip):
 
     run = jax.jit(jax.value_and_grad(loss, has_aux=True))
     (_, (terms, state)), gradient = run(jnp.float32(1.5))
-    labels = label_sequence(clip.ranges, clip.frames.cut, AT)
+    labels = label_sequence(clip.ranges, clip.frames.cut, at=AT)
     assert set(terms) == {"ghosting", "aliasing"}
     slope = 0.0
     for name, part in (("ghosting", slice(0, 3)), ("aliasing", slice(3, 6))):

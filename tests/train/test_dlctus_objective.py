@@ -69,7 +69,7 @@ def test_spatio_temporal_loss_follows_the_motion(theta):
 
 
 def test_gradients_reach_every_layer_through_the_history():
-    method, clip = dlctus(2), make_sequence(1, T=4, B=1, H=8, W=12)
+    method, clip = dlctus(scale=2), make_sequence(1, T=4, B=1, H=8, W=12)
     variables = method.init(jax.random.key(0), select_time(clip.frames, 0))
     objective = dlctus_objective(method, targets=1)
     value = lambda variables: sum(objective(variables, clip)[0].values())

@@ -44,7 +44,7 @@ def classification_objective(method: Method, *, thresholds: Thresholds = DEFAULT
         keep = lambda aux: {name: aux[name] for name in ("inputs", "known", "exposure")}  # noqa: E731
         given = jax.lax.stop_gradient(variables)
         seen = jax.lax.stop_gradient(unroll(method, given, clip.frames, every(), keep=keep).aux[SS])
-        labels = label_sequence(ranges, clip.frames.cut, thresholds, exposure=seen["exposure"])
+        labels = label_sequence(ranges, clip.frames.cut, at=thresholds, exposure=seen["exposure"])
         inputs = seen["inputs"].reshape(-1, *seen["inputs"].shape[-3:])
         logits, state = network.apply(variables["classifier"], inputs, train=True)
         logits = logits.reshape(*seen["known"].shape[:-1], -1)
