@@ -130,6 +130,11 @@ def display(color: Image) -> Image:
     return srgb_encode(reinhard(color))
 
 
+def display_of_log1p(encoded: Image) -> Image:
+    """``display(expm1(encoded))``, continued below 0 with its slope there, so that a loss leads back to colours."""
+    return display(expm1(encoded)) + 12.92 * jnp.minimum(encoded, 0.0)
+
+
 def display_inverse(encoded: Color) -> Color:
     """Inverse of ``display``; what is outside [0, 1) is clamped so that the result is finite and >= 0."""
     return reinhard_inverse(srgb_decode(jnp.clip(encoded, 0.0, 1.0)))

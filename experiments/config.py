@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from essjax.train import OPTIMIZERS
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -17,7 +19,7 @@ class Config:
       002: 0 for its dataset 1, -1 for its dataset 2), jitter ("halton", or "dlctus" where every frame is rendered).
     Training: clip (frames per BPTT window), crop (width, height), and for the last (or only) stage batch, width,
       learning_rate, steps, seconds; first_* are the same of the stage before it (ExtraSS: FRNet;
-      FASSET has none: first_width are RenderINR's neurons). anneal (false:
+      FASSET has none: first_width are RenderINR's neurons). optimizer ("muon" or "adam"), anneal (false:
       no stage's learning rate decays), fresh (new train scenes after so many steps, rendered in the meantime;
       None: always those on disk), save_every, the losses' weights of ExtraSS eq 9, 12, 14, vgg (path
       of VGG-16 weights); average (decay of a moving average of the weights over the steps; None: the last weights) and
@@ -52,6 +54,7 @@ class Config:
     first_seconds: float | None = 45.0
     steps: int | None = None
     seconds: float | None = 245.0
+    optimizer: str = "muon"
     anneal: bool = True
     fresh: int | None = None
     save_every: float = 30.0
@@ -85,7 +88,7 @@ PRESETS: dict[str, Config] = {
         train_spp=64, test_spp=64, clip=9, crop=(128, 128), batch=12, first_batch=8, width=24, first_width=24,
         first_learning_rate=1e-4, learning_rate=4e-4, occlusion_weight=1.0, temporal_weight=1.0,
         first_steps=100 * 900, steps=120 * 600, first_seconds=None, seconds=None, save_every=300.0, average=0.999,
-        validations=100, pictures=2,
+        validations=100, pictures=2, optimizer="adam",
     ),
 }  # fmt: skip
 """smoke: every part runs once, two minutes on two cores. quick: the default, ten minutes. paper: the
@@ -160,6 +163,8 @@ def _check(config: Config) -> None:
             raise ValueError(f"--set {name}: expected a number above 0, got {value}.")
     if config.average is not None and not 0 <= config.average < 1:
         raise ValueError(f"--set average: expected a decay in [0, 1), got {config.average}.")
+    if config.optimizer not in OPTIMIZERS:
+        raise ValueError(f"--set optimizer: expected one of {', '.join(sorted(OPTIMIZERS))}, got {config.optimizer!r}.")
     if not math.isfinite(config.mip_bias):
         raise ValueError(f"--set mip_bias: expected a finite number, got {config.mip_bias}.")
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from essjax.builtin import generate, plan
 from essjax.frames import select_time
 from essjax.rollout import ESS, SS, stream
-from essjax.train import create_state, make_train_step, optimizer
+from essjax.train import OPTIMIZERS, create_state, make_train_step
 from experiments.config import Config
 from experiments.trace import describe, operations
 from experiments.training import initial_variables, make_batches
@@ -27,7 +27,7 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
     if stages:
         stage = stages[-1]
         variables = initial_variables(stages, dataset, config)
-        transform = optimizer()
+        transform = OPTIMIZERS[config.optimizer]()
         step = make_train_step(stage.objective, transform, stage.name)
         state, batch = (
             create_state(variables, stage.name, transform),

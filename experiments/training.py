@@ -16,6 +16,7 @@ from essjax.data import CachedSource, Rounds, clips, disk_source, successive_cli
 from essjax.data.layout import Dataset
 from essjax.frames import Sequence, select_time
 from essjax.train import (
+    OPTIMIZERS,
     Checkpoints,
     Recurrent,
     TrainState,
@@ -24,7 +25,6 @@ from essjax.train import (
     create_state,
     learning_rate,
     make_train_step,
-    optimizer,
     read_progress,
     restore_stage,
     train,
@@ -141,14 +141,16 @@ def initial_state(stages: list[Stage], stage: Stage, config: Config, variables: 
     """
     needed = {name: variables[name] for name in _entries(stages, stage)}
     history = stage.objective.start(batch) if isinstance(stage.objective, Recurrent) else None
-    return create_state(needed, stage.name, optimizer(), history=history, average=config.average is not None)
+    return create_state(
+        needed, stage.name, OPTIMIZERS[config.optimizer](), history=history, average=config.average is not None
+    )
 
 
 def make_step(stage: Stage, config: Config) -> Callable:
     """The jitted step of a stage."""
     options = {} if config.average is None else {"average": config.average}
     return make_train_step(
-        stage.objective, optimizer(), stage.name, compiler_options=config.compiler_options, **options
+        stage.objective, OPTIMIZERS[config.optimizer](), stage.name, compiler_options=config.compiler_options, **options
     )
 
 

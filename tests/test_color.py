@@ -46,6 +46,15 @@ def test_demodulation_albedo_by_hand():
     np.testing.assert_allclose(shiny[0, 0], [0.58, 0.08, 0.28], rtol=1e-6)
 
 
+def test_display_of_log1p_leads_back_from_below_zero():
+    encoded = jnp.array([-0.2, 0.0, 1e-4, 0.3, 2.0])
+    shown = jax.jit(color.display_of_log1p)(encoded)
+    np.testing.assert_allclose(shown[1:], color.display(jnp.expm1(encoded[1:])), rtol=1e-6)
+    slopes = jax.vmap(jax.grad(color.display_of_log1p))(encoded)
+    np.testing.assert_allclose(slopes[jnp.array([0, 2])], 12.92, rtol=1e-2)
+    assert np.all(np.asarray(slopes) > 0)
+
+
 def test_display_by_hand():
     # reinhard(1) = 0.5; the sRGB curve: 1.055 * 0.5 ** (1 / 2.4) - 0.055. reinhard(0.001) is on the linear part.
     np.testing.assert_allclose(color.display(jnp.array(1.0)), 0.7353570, rtol=1e-5)

@@ -29,14 +29,25 @@ from essjax.train.objectives import (
     odd_length,
     predict_last,
 )
-from essjax.train.state import TrainState, averaged, constant, cosine, create_state, halving, learning_rate, optimizer
+from essjax.train.state import (
+    OPTIMIZERS,
+    TrainState,
+    adam,
+    averaged,
+    constant,
+    cosine,
+    create_state,
+    halving,
+    learning_rate,
+    muon,
+)
 from essjax.train.step import make_train_step
 
 __all__ = [
-    "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "Objective", "Recurrent", "TrainState", "Validation",
-    "averaged", "best_validation", "both_kinds", "chosen_variables", "classification_objective",
+    "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "OPTIMIZERS", "Objective", "Recurrent", "TrainState",
+    "Validation", "adam", "averaged", "best_validation", "both_kinds", "chosen_variables", "classification_objective",
     "composition_objective", "constant", "cosine", "create_state", "dlctus_objective", "extranet_objective",
     "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective", "learning_rate",
-    "make_train_step", "mean_score", "nsrr_objective", "odd_length", "optimizer", "predict_last", "read_progress",
+    "make_train_step", "mean_score", "muon", "nsrr_objective", "odd_length", "predict_last", "read_progress",
     "restore_stage", "train",
 ]  # fmt: skip

@@ -5,6 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 import optax
+import optax.contrib
 from jax.flatten_util import ravel_pytree
 
 from essjax.typing import Array, Callable, PyTree, pytree
@@ -19,7 +20,7 @@ class TrainState:
 
     Attributes:
       variables: all of the method's variables; a stage trains one entry, the others are frozen.
-      optimizer: optax state of the trained entry, its arrays behind each other as one vector.
+      optimizer: optax state of the trained entry.
       step: steps taken, int32.
       history: what the next clip goes on from where clips follow each other (``Recurrent``), else None.
       average: moving average of the trained weights, as one vector; or None.
@@ -32,13 +33,40 @@ class TrainState:
     average: Array | None = None
 
 
-def optimizer(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
-    """Adam (0.9, 0.999) behind a clip of the global gradient norm; the step multiplies with the learning rate.
+def adam(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
+    """Adam (0.9, 0.999) after a clip of the global gradient norm; the step multiplies with the learning rate.
 
     Gradients and both moments are one vector each: array by array, half of the time of compiling it was for loops over
     a few numbers.
     """
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(clip_norm), optax.scale_by_adam()))
+    return optax.chain(optax.clip_by_global_norm(clip_norm), optax.flatten(optax.scale_by_adam()))
+
+
+def muon(*, clip_norm: float = 1.0) -> optax.GradientTransformation:
+    """Muon for kernels, Adam for all else, after a clip of the global gradient norm; learning rates as for ``adam``.
+
+    A kernel's momentum, as a matrix of inputs by output channels, is brought near the closest orthogonal matrix (Jordan
+    et al. 2024), and its update to Adam's usual size (Liu et al. 2025): a few hundred steps go further than Adam's.
+    """
+    matrices = optax.contrib.muon(
+        learning_rate=-1.0,  # not here: the step multiplies with minus the rate
+        consistent_rms=0.2,
+        muon_weight_dimension_numbers=lambda kernels: jax.tree.map(_as_matrix, kernels),
+    )
+    parts = {"kernel": matrices, "other": optax.flatten(optax.scale_by_adam())}
+
+    def labels(weights: PyTree) -> PyTree:
+        return jax.tree.map(lambda leaf: "kernel" if leaf.ndim > 1 else "other", weights)
+
+    return optax.chain(optax.clip_by_global_norm(clip_norm), optax.partition(parts, labels))
+
+
+def _as_matrix(kernel: Array) -> optax.contrib.MuonDimensionNumbers:
+    last = kernel.ndim - 1
+    return optax.contrib.MuonDimensionNumbers(reduction_axis=tuple(range(last)), output_axis=(last,))
+
+
+OPTIMIZERS = {"adam": adam, "muon": muon}
 
 
 def create_state(

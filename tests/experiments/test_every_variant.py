@@ -11,7 +11,7 @@ import pytest
 from essjax.builtin import plan
 from essjax.frames import frame_images, select_time
 from essjax.rollout import alternate, every, unroll
-from essjax.train import create_state, make_train_step, optimizer
+from essjax.train import adam, create_state, make_train_step
 from experiments import datasets
 from experiments.ahead import batch_shapes, state_shapes
 from experiments.config import PRESETS
@@ -54,7 +54,7 @@ def train(name, dataset):
     stages, losses = stages_of(name, config), {}
     variables = initial_variables(stages, dataset, config)
     for stage in stages:
-        transform = optimizer()
+        transform = adam()
         step = make_train_step(stage.objective, transform, stage.name)
         names = [s.name for s in stages[: stages.index(stage) + 1]]
         state = create_state({entry: variables[entry] for entry in names}, stage.name, transform)

@@ -125,6 +125,12 @@ def extrass_aux(variables, history, frame, kind):
     return {"log_image": with_frame(IMAGES[kind], frame), "warped": warped, "features": features}
 
 
+def seen(color):
+    """x / (1 + x), then the sRGB curve of IEC 61966-2-1."""
+    bounded = np.asarray(color, np.float64) / (1.0 + np.asarray(color, np.float64))
+    return np.where(bounded <= 0.0031308, 12.92 * bounded, 1.055 * bounded ** (1.0 / 2.4) - 0.055)
+
+
 def weighted(values, mask):
     mask = np.broadcast_to(mask, values.shape)
     return np.sum(values * mask) / np.sum(mask)
@@ -142,16 +148,18 @@ def test_extrass_terms_equal_numpy(exact_masks):
 
     number = np.repeat(np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
     brightness, weight = 1.0 + 0.1 * number, (number + 1) / 8.0
-    target = np.log1p(np.asarray(clip.reference[1:-1]))
+    reference = np.asarray(clip.reference[1:-1])
+    target = seen(reference)
     expected = {"features": 0.0}
     for kind, name in ((0, SS), (1, ESS)):
-        image, history = (np.asarray(pattern[kind]) * brightness for pattern in (IMAGES, HISTORIES))
+        colors = [np.expm1(np.asarray(pattern[kind]) * brightness) for pattern in (IMAGES, HISTORIES)]
+        image, history = map(seen, colors)
         own = np.broadcast_to(np.asarray(VALID[kind], np.float64), (T - 2, B, 2 * H, 2 * W, 1))
         valid = np.repeat(np.repeat(clip.valid[1:-1], 2, axis=2), 2, axis=3) if exact_masks else own
         expected[f"l1_{name}"] = weighted(np.abs(image - target), weight)
         expected[f"occlusion_{name}"] = 2.0 * weighted(np.abs(image - target), weight * (1.0 - valid))
         expected[f"temporal_{name}"] = 3.0 * weighted(np.abs(image - history), weight * own)
-        difference = np.expm1(image) - np.expm1(target)
+        difference = colors[0] - reference
         levels = difference[..., ::2, ::2, :], 3.0 * difference[..., :1]
         expected[f"vgg_{name}"] = 0.5 * sum(weighted(level**2, weight) for level in levels)
     for a, b in zip(FEATURES[0], FEATURES[1], strict=True):
@@ -171,11 +179,11 @@ def test_frames_since_a_cut():
 
 def test_a_frame_counts_the_more_the_longer_its_shot_has_lasted():
     """(n + 1) / 8 for frame n of a start; all alike in the clip that follows it."""
-    reference = np.log1p(np.asarray(numbered(17).reference))
+    reference = seen(numbered(17).reference)
     for number, terms in enumerate(follow(extrass_objective(fake(extrass_aux)), 2, 9)):
         frames = np.arange(1, 8) + 8 * number
         images = np.asarray(IMAGES[0]) * (1.0 + 0.1 * frames).reshape(7, 1, 1, 1, 1)
-        errors = np.abs(images - reference[frames]).mean(axis=(1, 2, 3, 4))
+        errors = np.abs(seen(np.expm1(images)) - reference[frames]).mean(axis=(1, 2, 3, 4))
         weight = np.minimum((frames + 1) / 8, 1.0)
         np.testing.assert_allclose(terms["l1_ss"], np.sum(weight * errors) / np.sum(weight), rtol=1e-5)
 

@@ -10,7 +10,7 @@ import pytest
 
 from essjax.frames import select_time
 from essjax.methods import extrass, extrass_e, warp
-from essjax.train import create_state, extrass_objective, frnet_objective, make_train_step, optimizer
+from essjax.train import adam, create_state, extrass_objective, frnet_objective, make_train_step
 from tests.methods.scene import wall
 
 STEPS = 15
@@ -34,12 +34,12 @@ def stage(request, clip, variables):
         objective, variables = frnet_objective(extrass_e(width=4)), {"frnet": variables["frnet"]}
     else:
         objective = extrass_objective(extrass(width=4, frnet_width=4))
-    return request.param, make_train_step(objective, optimizer(), request.param), variables
+    return request.param, make_train_step(objective, adam(), request.param), variables
 
 
 def test_loss_falls_and_only_the_trained_part_moves(stage, clip):
     name, step, variables = stage
-    state, losses = create_state(variables, name, optimizer()), []
+    state, losses = create_state(variables, name, adam()), []
     for _ in range(STEPS):
         state, terms = step(state, clip, 3e-3)
         losses.append(float(terms["loss"]))
@@ -63,7 +63,7 @@ def test_nan_keeps_the_old_variables(stage, clip):
         reference=clip.reference.at[2, 0, 3, 4].set(jnp.nan),
         frames=dataclasses.replace(clip.frames, color=clip.frames.color.at[2, 0, 3, 4].set(jnp.nan)),
     )
-    state, terms = step(create_state(variables, name, optimizer()), spoilt, 1e-3)
+    state, terms = step(create_state(variables, name, adam()), spoilt, 1e-3)
     assert not np.isfinite(float(terms["loss"]))
     jax.tree.map(np.testing.assert_array_equal, state.variables, variables)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.optimizer))

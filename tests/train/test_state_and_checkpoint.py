@@ -12,6 +12,7 @@ import pytest
 from essjax.train import (
     Checkpoints,
     Recurrent,
+    adam,
     averaged,
     constant,
     cosine,
@@ -19,19 +20,19 @@ from essjax.train import (
     halving,
     learning_rate,
     make_train_step,
-    optimizer,
+    muon,
 )
 from tests.train import tiny_run
 
 
 def state_of(width):
     variables = {"net": {"kernel": jnp.arange(2.0 * width).reshape(2, width)}, "other": {"b": jnp.ones(3)}}
-    return create_state(variables, "net", optimizer())
+    return create_state(variables, "net", adam())
 
 
 def test_unknown_entry():
     with pytest.raises(ValueError, match="trained: expected one of fit, frozen, got 'frnet'"):
-        create_state({"fit": {}, "frozen": {}}, "frnet", optimizer())
+        create_state({"fit": {}, "frozen": {}}, "frnet", adam())
 
 
 def test_learning_rate():
@@ -60,7 +61,7 @@ def test_statistics_are_folded_in_and_have_no_gradient():
         state = {name: {"batch_stats": {"mean": variables[name]["batch_stats"]["mean"] + 1.0}} for name in "ab"}
         return {"sum": jnp.sum(variables["a"]["params"]["w"] * variables["a"]["batch_stats"]["mean"])}, state
 
-    transform = optimizer()
+    transform = adam()
     step = make_train_step(objective, transform, "a")
     state, terms = step(create_state(variables, "a", transform), next(tiny_run.tiny_batches()), 0.1)
     np.testing.assert_allclose(terms["gradient_norm"], 3.0 * np.sqrt(2.0), rtol=1e-6)
@@ -73,7 +74,22 @@ def test_statistics_are_folded_in_and_have_no_gradient():
 def test_the_moments_of_all_arrays_are_one_vector_each():
     """Hundreds of tiny loops take as long to compile as a network."""
     weights = {name: {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)} for name in ("first", "second")}
-    assert sorted(leaf.shape for leaf in jax.tree.leaves(optimizer().init(weights))) == [(), (18,), (18,)]
+    assert sorted(leaf.shape for leaf in jax.tree.leaves(adam().init(weights))) == [(), (18,), (18,)]
+
+
+def test_muon_moves_kernels_by_orthogonal_matrices_and_all_else_as_adam():
+    """NumPy's singular values: of a first step are alike, whatever the gradient's."""
+    random = np.random.default_rng(0)
+    weights = {"kernel": jnp.zeros((3, 3, 5, 7)), "bias": jnp.zeros(7)}
+    gradient = {
+        "kernel": jnp.asarray(random.normal(size=(3, 3, 5, 7)) * 0.01),
+        "bias": jnp.asarray(random.normal(size=7)),
+    }
+    updates, plain = (t.update(gradient, t.init(weights), weights)[0] for t in (muon(), adam()))
+    values = np.linalg.svd(np.asarray(updates["kernel"]).reshape(45, 7), compute_uv=False) / (0.2 * np.sqrt(45))
+    assert values.min() > 0.6 and values.max() < 1.3
+    assert np.sum(updates["kernel"] * gradient["kernel"]) > 0  # along the gradient: the step goes against it
+    np.testing.assert_allclose(updates["bias"], plain["bias"], rtol=1e-6)
 
 
 def test_one_step_equals_adam_by_hand():
@@ -115,7 +131,7 @@ def test_the_average_forgets_the_start():
 
 def test_statistics_are_not_averaged():
     entry = {"params": {"w": jnp.ones((2, 1)), "b": jnp.zeros(3)}, "batch_stats": {"mean": jnp.full(2, 3.0)}}
-    state = create_state({"net": entry}, "net", optimizer(), average=True)
+    state = create_state({"net": entry}, "net", adam(), average=True)
     assert state.average.shape == (5,)
     jax.tree.map(np.testing.assert_array_equal, averaged(state, "net"), {"net": entry})
 
@@ -143,9 +159,9 @@ def test_a_recurrent_objective_carries_its_history_in_the_state(tmp_path):
     objective = Recurrent(lambda clip: jnp.zeros_like(clip.frames.color[0]), follow)
     batches = tiny_run.tiny_batches()
     clips = [jax.tree.map(jnp.asarray, next(batches)) for _ in range(2)]
-    state, step = tiny_run.initial_state(), make_train_step(objective, optimizer(), "fit")
+    state, step = tiny_run.initial_state(), make_train_step(objective, adam(), "fit")
     variables = {name: state.variables[name] for name in ("fit", "frozen")}
-    state = create_state(variables, "fit", optimizer(), history=objective.start(clips[0]))
+    state = create_state(variables, "fit", adam(), history=objective.start(clips[0]))
     for clip in clips:
         state, _ = step(state, clip, 0.1)
     expected = np.asarray(clips[0].frames.color[0] + clips[1].frames.color[0])
@@ -164,7 +180,7 @@ def test_a_recurrent_objective_carries_its_history_in_the_state(tmp_path):
 def test_the_callers_variables_survive_donation():
     variables = {"fit": {"w": jnp.zeros(3)}, "frozen": {"b": jnp.ones(())}}
     clip = next(tiny_run.tiny_batches())
-    tiny_run.tiny_step()(create_state(variables, "fit", optimizer()), clip, 0.1)
+    tiny_run.tiny_step()(create_state(variables, "fit", adam()), clip, 0.1)
     np.testing.assert_array_equal(variables["fit"]["w"], 0.0)
     np.testing.assert_array_equal(variables["frozen"]["b"], 1.0)
 
@@ -205,7 +221,7 @@ def test_no_checkpoint(tmp_path):
 def test_other_shapes_and_other_trees(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(7, state_of(3), {"seconds": 1.0})
-    other = create_state({"net": {"weights": jnp.zeros(3)}}, "net", optimizer())
+    other = create_state({"net": {"weights": jnp.zeros(3)}}, "net", adam())
     for wrong in (state_of(4), other):
         with pytest.raises(ValueError, match="checkpoint 7 does not fit this configuration") as caught:
             checkpoints.restore(wrong)

@@ -19,10 +19,10 @@ from essjax.train import (
     Budget,
     Checkpoints,
     Validation,
+    adam,
     create_state,
     learning_rate,
     make_train_step,
-    optimizer,
     restore_stage,
     train,
 )
@@ -51,13 +51,13 @@ def objective(variables, clip):
 def initial_state(average=True):
     """``fit`` is trained, ``frozen`` is not."""
     variables = {"fit": {"w": jnp.zeros(3)}, "frozen": {"b": jnp.ones(())}}
-    return create_state(variables, "fit", optimizer(), average=average)
+    return create_state(variables, "fit", adam(), average=average)
 
 
 @functools.cache
 def tiny_step():
     """The jitted step, compiled once per process."""
-    return make_train_step(objective, optimizer(), "fit", average=0.5)
+    return make_train_step(objective, adam(), "fit", average=0.5)
 
 
 def validation(times=4):

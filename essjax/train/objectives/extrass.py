@@ -2,13 +2,13 @@
 
 A clip is unrolled twice, one frame apart, so that every inner frame is predicted as SS and as ESS, each from the
 history that the alternation gives it at inference (ExtraSS section 4.5; docs/deviations.md says why not from one shared
-history). Losses are on log(1 + x).
+history). FRNet's losses are on log(1 + x), those of ExtraSSNet on what a viewer sees (docs/deviations.md).
 """
 
 import jax
 import jax.numpy as jnp
 
-from essjax.color import expm1, expose, log1p
+from essjax.color import display, display_of_log1p, expm1, expose, log1p
 from essjax.frames import Sequence, rendered_color
 from essjax.interfaces import Method
 from essjax.losses import (
@@ -114,17 +114,19 @@ def extrass_objective(
         pixels = weight[..., None, None, None]
         terms: dict[str, Array] = {}
         for kind, predicted in kinds.items():
-            image, warped = predicted["log_image"], predicted["warped"]
-            target = log1p(expose(clip.reference[1:-1], predicted["exposure"]))
+            warped = predicted["warped"]
+            image, before = display_of_log1p(predicted["log_image"]), display_of_log1p(warped.log_image)
+            reference = expose(clip.reference[1:-1], predicted["exposure"])
+            target = display(reference)
             valid = warped.valid if clip.valid is None else nearest_upsample(clip.valid[1:-1], clip.scale)
             hole = (1 - valid) * (since > 0)[..., None, None, None]
             counts = jnp.where(since > 0, weight, 0.0) if kind == ESS else weight
             terms[f"l1_{kind}"] = frame_mean(l1(image, target), counts)
             terms[f"occlusion_{kind}"] = occlusion_weight * masked_mean(occlusion(image, target, hole), pixels * hole)
-            change = temporal_l1(image, warped.log_image, warped.valid)
+            change = temporal_l1(image, before, warped.valid)
             terms[f"temporal_{kind}"] = temporal_weight * masked_mean(change, pixels * warped.valid)
             if vgg_features is not None:
-                levels = perceptual(expm1(image), expm1(target), vgg_features)
+                levels = perceptual(expm1(predicted["log_image"]), reference, vgg_features)
                 terms[f"vgg_{kind}"] = vgg_weight * sum(frame_mean(level, counts) for level in levels)
         # Without the frame after a cut: as SS it starts a run, so E0 sees no history there, and E1 does.
         weight = jnp.where(since > 1, weight, 0.0)

@@ -13,12 +13,12 @@ from essjax.builtin import generate, plan
 from essjax.frames import Frame, Sequence
 from essjax.interfaces import Method
 from essjax.rollout import alternate, unroll
-from essjax.train import create_state, make_train_step, optimizer
+from essjax.train import create_state, make_train_step, muon
 from experiments.benchmark import inputs
 from experiments.benchmark.measure import Case, measure, summary
 from experiments.benchmark.suites import Options, Row
 from experiments.config import Config, make_config
-from experiments.training import first_batch, initial_state, initial_variables, make_batches
+from experiments.training import first_batch, initial_state, initial_variables, make_batches, make_step
 from experiments.variants import stages_of
 from experiments.variants.base import Stage
 
@@ -56,7 +56,7 @@ def _default_case(stage: Stage, config: Config) -> Case:
 def _case(name: str, stage: Stage, clip: Sequence) -> Case:
     length, batch, height, width = clip.frames.motion.shape[:4]
     variables = stage.method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
-    transform = optimizer()
+    transform = muon()
     step = make_train_step(stage.objective, transform, stage.name)
     # The state is donated inside; here it is an ordinary argument, so that a repetition starts where the last did.
     return Case(
@@ -101,8 +101,7 @@ def _loaded(*settings: str) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         clips = plan("train", 1, config.train_frames, spp=1, families=["carousel"])
         dataset = generate(Path(folder), clips, *config.size, scale=config.scale)
-        transform = optimizer()
-        step = make_train_step(stage.objective, transform, stage.name)
+        step = make_step(stage, config)
         variables = initial_variables([stage], dataset, config)
         state = initial_state([stage], stage, config, variables, first_batch(dataset, config, stage))
         batches, waited, seconds = make_batches(dataset, config, stage), [], []
