@@ -147,3 +147,31 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert command in (ROOT / ".ci" / "run").read_text().splitlines()
     assert command in (ROOT / "README.md").read_text()
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
+
+
+def circles(edges: dict[str, set[str]]) -> list[str]:
+    """Modules that import themselves by way of others."""
+    found = []
+    for module in edges:
+        reached, new = set(), edges[module]
+        while new:
+            reached |= new
+            new = {name for each in new for name in edges.get(each, ())} - reached
+        if module in reached:
+            found.append(module)
+    return sorted(found)
+
+
+def test_modules_of_essjax_do_not_import_each_other_in_circles():
+    """Also not inside functions, where Triton kernels are imported."""
+    modules = {module_name(path): path for path in sources() if path.is_relative_to(ROOT / "essjax")}
+    edges: dict[str, set[str]] = {module: set() for module in modules}
+    for module, path in modules.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                for name in (f"{node.module}.{alias.name}" for alias in node.names):
+                    edges[module].add(name if name in modules else str(node.module))
+            elif isinstance(node, ast.Import):
+                edges[module] |= {alias.name for alias in node.names}
+    assert not circles(edges)
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from essjax import kernels
-from essjax.networks.precision import current_itemsize, in_compute_dtype
+from essjax.networks.precision import LIKED, current_itemsize, in_compute_dtype, pad_channels
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
 Padding = tuple[tuple[int, int], ...]
@@ -156,20 +156,6 @@ def _vary_alike(*arrays: jax.Array) -> list[jax.Array]:
         lax.pcast(array, tuple(axes - own), to="varying") if axes - own else array
         for array, own in zip(arrays, varying, strict=True)
     ]
-
-
-LIKED = 8
-"""Channels come in multiples of this where a GPU multiplies 16-bit numbers: 16 bytes, one access."""
-
-
-def pad_channels(x: jax.Array) -> jax.Array:
-    """16-bit images with zeros behind their channels up to a multiple of ``LIKED``; others unchanged.
-
-    cuDNN pads by passes of its own; written out, XLA joins it with what makes the image.
-    """
-    if x.dtype.itemsize != 2 or x.shape[-1] % LIKED == 0:
-        return x
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -x.shape[-1] % LIKED)])
 
 
 def _pad_kernel(kernel: jax.Array) -> jax.Array:

@@ -13,7 +13,7 @@ import triton.language as tl
 from jax import lax
 
 from essjax import kernels
-from essjax.networks.convolution import pad_channels
+from essjax.networks.precision import pad_channels
 from essjax.typing import Array
 
 

@@ -6,9 +6,10 @@ centres lie at +0.5. All functions may be jitted, vmapped and differentiated.
 
 from essjax.warp._splat import splat, splat_nearest
 from essjax.warp.backward import backward_warp
+from essjax.warp.candidates import candidate_offsets
 from essjax.warp.fetches import sample_by_fetches
 from essjax.warp.fill import fill_holes
-from essjax.warp.gbuffer_guided import candidate_offsets, gbuffer_guided_warp, guided_weights, guides
+from essjax.warp.gbuffer_guided import gbuffer_guided_warp, guided_weights, guides
 from essjax.warp.motion import compose_motion, dilate_motion, jittered_motion, splat_motion, upsample_motion
 from essjax.warp.occlusion import hole_mask, occlusion_motion
 from essjax.warp.resample import Resampled, gaussian_resample, tent_resample

@@ -18,9 +18,9 @@ from essjax import kernels
 from essjax.frames import GBuffers, surface_guides
 from essjax.typing import Array, Image, Motion
 from essjax.warp._batch import check_channels, over_leading_axes
+from essjax.warp.candidates import BORDER, FAR, LEAST, LIMIT, MARGIN, REACH, UNUSABLE, candidate_offsets
 from essjax.warp.sampling import gather_pixels
 
-STRIDES = (1, 3, 5, 9)
 WINNERS = 4
 _SORT_FOUR = ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))
 _SORT_BITONIC = ((0, 2), (1, 3), (0, 1), (2, 3))
@@ -28,23 +28,9 @@ SIGMA_GUIDE = (0.15, 0.15, 0.15, 0.14, 0.14, 0.14)
 """Base colour, normal: chosen on validation frames (experiments/LOG.md); the paper gives none."""
 SIGMA_DISTANCE = 2.0
 _ID_MASK = 63  # 6 bits hold a candidate's number
-LIMIT = 1e15  # scaled guides beyond this match nothing
-BORDER = 1e17  # the scaled guide of what cannot be used: squared, and summed over channels, still finite
-UNUSABLE = 1e33  # costs of candidates with such a guide are above, all others below
 _LEAST_SIGMA = 1e-13  # smaller ones count as this: costs stay finite
-LEAST = 1e-30  # added to costs: their keys are normal numbers, which no backend flushes to zero
-_REACH = max(STRIDES)
-MARGIN = 2 * _REACH + 1
-"""Pixels around the planes of the previous guides that match nothing: reads never need a comparison of positions."""
-FAR = 1e6  # pixels; keeps integers from overflowing
 SELECTIONS = ("network", "reference")
 IMPLEMENTATIONS = ("auto", *SELECTIONS, "triton")
-
-
-def candidate_offsets() -> np.ndarray:
-    """The 33 offsets ``[33, 2]`` (x, y) of eq 1 in the order that breaks ties: centre, then by stride, row, column."""
-    ring = [(s * k, s * l) for s in STRIDES for l in (-1, 0, 1) for k in (-1, 0, 1) if (k, l) != (0, 0)]  # noqa: E741
-    return np.array([(0, 0), *ring], np.int32)
 
 
 def guides(gbuffers: GBuffers) -> Image:
@@ -95,8 +81,8 @@ def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) ->
     here = _scaled(guide, scale, -BORDER)
     x, y = _coordinates(motion)
     # Beyond this clamp all candidates are outside already.
-    x = jnp.clip(x, -_REACH - 0.5, width + _REACH + 0.5)
-    y = jnp.clip(y, -_REACH - 0.5, height + _REACH + 0.5)
+    x = jnp.clip(x, -REACH - 0.5, width + REACH + 0.5)
+    y = jnp.clip(y, -REACH - 0.5, height + REACH + 0.5)
     column, row = jnp.floor(x), jnp.floor(y)
     start = (row.astype(jnp.int32) + MARGIN) * stride + column.astype(jnp.int32) + MARGIN
     fraction = (x - column - 0.5, y - row - 0.5)

@@ -15,7 +15,7 @@ import triton.language as tl
 
 from essjax import kernels
 from essjax.typing import Array
-from essjax.warp import gbuffer_guided as xla
+from essjax.warp.candidates import BORDER, FAR, LEAST, LIMIT, MARGIN, REACH, UNUSABLE, candidate_offsets
 
 BLOCK = (1, 128)
 """Rows and columns of a program's tile."""
@@ -212,8 +212,8 @@ def constants(radiance: Any, guide: Any, shared: tuple[bool, ...]) -> dict[str, 
     """
     return {
         "height": radiance.shape[1], "width": radiance.shape[2], "depth": radiance.shape[3], "channels": guide.shape[3],
-        "shared": shared, "count": len(xla.candidate_offsets()), "margin": xla.MARGIN, "reach": max(xla.STRIDES),
-        "limit": xla.LIMIT, "border": xla.BORDER, "unusable": xla.UNUSABLE, "least": xla.LEAST, "far": xla.FAR,
+        "shared": shared, "count": len(candidate_offsets()), "margin": MARGIN, "reach": REACH, "limit": LIMIT,
+        "border": BORDER, "unusable": UNUSABLE, "least": LEAST, "far": FAR,
         "block_rows": BLOCK[0], "block_columns": BLOCK[1],
     }  # fmt: skip
 
@@ -232,7 +232,7 @@ def guided(radiance: Array, planes: Array, guide: Array, motion: Array, scale: A
     return kernels.call(
         guided_kernel,
         *arrays,
-        jnp.asarray(xla.candidate_offsets()),
+        jnp.asarray(candidate_offsets()),
         out_shape=[
             jax.ShapeDtypeStruct((batch, height, width, depth), radiance.dtype),
             jax.ShapeDtypeStruct((batch, height, width), jnp.int32),

@@ -9,7 +9,7 @@ from essjax import kernels
 from essjax.deploy import multiply_adds
 from essjax.networks import compute_dtype, extrassnet
 from essjax.networks.blocks import conv
-from essjax.networks.convolution import LIKED, pad_channels
+from essjax.networks.precision import LIKED, pad_channels
 from tests.triton_on_cpu import is_called, load
 
 NAME = "essjax.networks.convolution_triton"
