@@ -6,6 +6,7 @@ import inspect
 import pkgutil
 import subprocess
 import sys
+import tomllib
 
 import essjax
 from tests.test_architecture import ROOT, module_name, sources
@@ -117,3 +118,11 @@ def test_tunables_are_keyword_only():
         if inspect.isfunction(value)
     }
     assert {name: arguments for name, arguments in found.items() if arguments} == DATA
+
+
+def test_the_wheel_holds_essjax_alone():
+    """``experiments`` run from the clone; ``pip install`` puts one name into site-packages."""
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        setuptools = tomllib.load(file)["tool"]["setuptools"]
+    assert setuptools["packages"]["find"] == {"include": ["essjax*"]}
+    assert all(package.startswith("essjax.") for package in setuptools["package-data"])
