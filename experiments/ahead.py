@@ -8,28 +8,29 @@ from essjax.builtin import Clip, live_source
 from essjax.frames import Sequence, select_time
 from essjax.train import TrainState
 from essjax.typing import Array
-from experiments.config import Config
 from experiments.datasets import render_settings
+from experiments.members import Member
+from experiments.settings import Settings
 from experiments.training import check_crop, clip_length, initial_state, make_step
-from experiments.variants.base import Stage
+from experiments.variants import Stage
 
 
-def batch_shapes(config: Config, stage: Stage) -> Sequence:
+def batch_shapes(settings: Settings, stage: Stage) -> Sequence:
     """What ``make_batches`` gives on the built-in scenes, as ``jax.ShapeDtypeStruct``s; one small frame is rendered."""
-    width, height = check_crop(config, *config.size)
+    width, height = check_crop(stage.settings, *settings.data.size, settings.data.scale)
     clip = Clip("train", "carousel", 0, frames=1, spp=1)
-    one = live_source([clip], width, height, **render_settings(config), ranges=stage.ranges)[0]
-    length = clip_length(stage, config, config.train_frames)
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((length, stage.batch, *leaf.shape[1:]), leaf.dtype), one)
+    one = live_source([clip], width, height, **render_settings(settings), ranges=stage.ranges)[0]
+    lead = clip_length(stage, settings.data.train_frames), stage.settings.batch
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), leaf.dtype), one)
 
 
 class Ahead:
     """The train steps of a variant on the built-in scenes, in the making: a thread compiles them in order."""
 
-    def __init__(self, stages: list[Stage], config: Config):
+    def __init__(self, member: Member):
         """Starts at once."""
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="essjax-ahead")
-        futures = {stage.name: self._worker.submit(_compile, stages, stage, config) for stage in stages}
+        futures = {stage.name: self._worker.submit(_compile, member, stage) for stage in member.stages}
         self.steps = {name: _Awaited(list(futures.values()), step) for name, step in futures.items()}
         """Stage -> its step, for ``train``."""
 
@@ -53,16 +54,16 @@ class _Awaited:
         return self._step.result()
 
 
-def state_shapes(stages: list[Stage], stage: Stage, config: Config, batch: Sequence) -> TrainState:
-    """The state that ``train_stages`` starts ``stage`` with, as ``jax.ShapeDtypeStruct``s."""
+def state_shapes(member: Member, stage: Stage, batch: Sequence) -> TrainState:
+    """The state that ``train_member`` starts ``stage`` with, as ``jax.ShapeDtypeStruct``s."""
 
     def make(key: Array, batch: Sequence) -> TrainState:
-        variables = stages[-1].method.init(key, select_time(batch.frames, 0))
-        return initial_state(stages, stage, config, variables, batch)
+        variables = member.stages[-1].method.init(key, select_time(batch.frames, 0))
+        return initial_state(member, stage, variables, batch)
 
     return jax.eval_shape(make, jax.random.key(0), batch)
 
 
-def _compile(stages: list[Stage], stage: Stage, config: Config):
-    batch = batch_shapes(config, stage)
-    return make_step(stage, config).lower(state_shapes(stages, stage, config, batch), batch, 0.0).compile()
+def _compile(member: Member, stage: Stage):
+    batch = batch_shapes(member.settings, stage)
+    return make_step(stage, member.settings).lower(state_shapes(member, stage, batch), batch, 0.0).compile()

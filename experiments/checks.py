@@ -1,86 +1,84 @@
 """What is refused before anything is rendered, read or trained: settings and data that do not fit together."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from essjax.data import Dataset, Segment
 from essjax.interfaces import MethodInfo
 from essjax.scenes import make_scene
-from experiments.config import Config
 from experiments.datasets import scene_clips
 from experiments.evaluate import scored_frames
+from experiments.members import Member
+from experiments.settings import Settings
 from experiments.training import check_batches, check_crop
-from experiments.variants import VARIANTS, stages_of
 
 
-def check_settings(names: Sequence[str], configs: Mapping[str, Config]) -> None:
+def check_settings(members: Sequence[Member]) -> None:
     """Refuse settings that the built-in scenes cannot be trained or scored with; nothing is rendered for it.
 
     Raises:
       ValueError: the crop is too small, a variant has another scale, or a sequence has no frame that is scored.
     """
-    for name in names:
-        config = configs[name]
-        if stages_of(name, config):
-            check_crop(config, *config.size)
-        reason = unfit_scale(VARIANTS[name].method(config).info, config.scale)
+    settings = members[0].settings
+    for member in members:
+        for stage in member.stages:
+            check_crop(stage.settings, *settings.data.size, settings.data.scale)
+        reason = unfit_scale(member.method.info, settings.data.scale)
         if reason:
-            raise ValueError(f"{name}: {reason}. Set scale, or leave it out.")
-    config = configs[names[0]]
-    clips = scene_clips(config)
-    for split in scored_splits(config):
+            raise ValueError(f"{member.name}: {reason}. Set data.scale, or leave it out.")
+    clips = scene_clips(settings)
+    for split in scored_splits(settings):
         cuts = {clip.name: make_scene(clip.family, clip.seed, clip.frames).cut for clip in clips if clip.split == split}
-        empty = [name for name, cut in cuts.items() if not scored_frames(cut, [True] * len(cut), config.warmup)]
-        _refuse_empty("the built-in scenes", split, empty, config)
+        warmup = settings.evaluation.warmup
+        empty = [name for name, cut in cuts.items() if not scored_frames(cut, [True] * len(cut), warmup)]
+        _refuse_empty("the built-in scenes", split, empty, settings)
 
 
-def check_dataset(names: Sequence[str], configs: Mapping[str, Config], dataset: Dataset) -> None:
+def check_dataset(members: Sequence[Member], dataset: Dataset) -> None:
     """Refuse data that the variants cannot be trained on or scored with, from its records alone.
 
     Raises:
       ValueError: a sequence has no frame that is scored, a variant needs buffers, a scale or frames that the data
         lacks, or no clip can be cut out of it.
     """
-    check_scored(dataset, configs[names[0]])
-    for name in names:
-        reason = unfit(
-            VARIANTS[name].method(configs[name]).info, {"motion", *dataset.info.channels}, dataset.info.scale
-        )
+    check_scored(dataset, members[0].settings)
+    for member in members:
+        reason = unfit(member.method.info, {"motion", *dataset.info.channels}, dataset.info.scale)
         if reason:
-            raise ValueError(f"{dataset.path}: {name} cannot run on it: {reason}. Leave it out, or import more.")
-        for stage in stages_of(name, configs[name]):
-            check_batches(dataset, configs[name], stage)
+            raise ValueError(f"{dataset.path}: {member.name} cannot run on it: {reason}. Leave it out, or import more.")
+        for stage in member.stages:
+            check_batches(dataset, member.settings, stage)
 
 
-def check_scored(dataset: Dataset, config: Config) -> None:
+def check_scored(dataset: Dataset, settings: Settings) -> None:
     """Refuse data with sequences of which no frame is scored, before anything is trained.
 
     Raises:
       ValueError: a test sequence, or a validation sequence where they are used, is all warm-up.
     """
-    for split in scored_splits(config):
-        empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, config)]
-        _refuse_empty(dataset.path, split, empty, config)
+    for split in scored_splits(settings):
+        empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, settings)]
+        _refuse_empty(dataset.path, split, empty, settings)
 
 
-def scored_splits(config: Config) -> tuple[str, ...]:
+def scored_splits(settings: Settings) -> tuple[str, ...]:
     """Splits whose frames are scored in a run."""
-    return ("validation", "test") if config.tune or config.validations else ("test",)
+    return ("validation", "test") if settings.evaluation.tune or settings.training.validations else ("test",)
 
 
-def _has_scored(dataset: Dataset, segment: Segment, config: Config) -> bool:
+def _has_scored(dataset: Dataset, segment: Segment, settings: Settings) -> bool:
     """What ``load_clip`` will find, without reading an image."""
     cuts = {record["number"]: record["cut"] for record in dataset.sequences[segment.sequence].frames}
     numbers = dataset.numbers(segment)
-    return bool(scored_frames([cuts[n] for n in numbers], dataset.scored(segment), config.warmup))
+    return bool(scored_frames([cuts[n] for n in numbers], dataset.scored(segment), settings.evaluation.warmup))
 
 
-def _refuse_empty(where: str | Path, split: str, empty: Sequence[str], config: Config) -> None:
+def _refuse_empty(where: str | Path, split: str, empty: Sequence[str], settings: Settings) -> None:
     if empty:
         raise ValueError(
             f"{where}, split {split}: expected frames to score in every sequence, got none in "
-            f"{', '.join(empty)}: all are among the {config.warmup} that warm up at the start and after a cut. "
-            "Give longer sequences, or fewer frames to warm up with --set warmup=N."
+            f"{', '.join(empty)}: all are among the {settings.evaluation.warmup} that warm up at the start and after a "
+            "cut. Give longer sequences, or fewer frames to warm up with --set evaluation.warmup=N."
         )
 
 

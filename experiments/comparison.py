@@ -6,17 +6,17 @@ from typing import Any, NamedTuple
 
 import jax
 
-from essjax.data import Dataset
 from essjax.data.layout import read_json, write_json
 from essjax.frames import Sequence as FrameSequence
 from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.typing import PyTree
 from experiments import checks
-from experiments.config import Config
 from experiments.evaluate import Clip, Clips, Runner
+from experiments.members import Member
+from experiments.settings import with_value
 from experiments.tuning import Setting, setting_variables, tune
-from experiments.variants import VARIANTS, compared, stages_of, trained_as
+from experiments.variants import VARIANTS
 
 
 class Trained(NamedTuple):
@@ -25,73 +25,59 @@ class Trained(NamedTuple):
     Attributes:
       initial: entry -> linen variables, before training.
       variables: the same after it.
-      config: the settings that it was trained with.
       report: stage -> what ``essjax.train.train`` says of it.
     """
 
     initial: PyTree
     variables: PyTree
-    config: Config
     report: dict[str, Any]
 
 
 def make_runners(
+    members: Mapping[str, Member],
     names: Sequence[str],
-    config: Config,
     trained: Mapping[str, Trained],
     validation: Clips,
     out: Path,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict[str, Runner], dict[str, Setting]]:
-    """Runners of the variants ``names`` and of what they are compared with; the TAA family is tuned on ``validation``.
+    """Runners of the rows that fit the data; the TAA family is tuned on ``validation``.
 
     The chosen settings are kept in ``out / "tuning.json"``: a resumed run does not search again.
 
     Args:
-      names: variants that must have a row.
-      config: the settings of methods that are not trained.
-      trained: variant -> what its training gave; of those that ``names`` and their parts take their weights from.
+      members: all rows, in the order of the table.
+      names: those that must have a row.
+      trained: owner -> what its training gave.
       validation: for tuning.
       out: folder of the run.
       on_step: called with what is being tuned.
     """
     example = validation.outline(0).sequence
-    native = example.native is not None
-    runners, settings = {}, {}
+    runners, chosen = {}, {}
     kept = _read_settings(out / "tuning.json")
     frames = select_time(example.frames, 0)
-    for row in compared(names):
-        variant, owner = VARIANTS[row], owner_of(row, names, trained)
-        own_config = trained[owner].config if owner else config
-        method = variant.method(own_config)
-        if method.info.native and not native:
+    for row, member in members.items():
+        method, settings = member.method, member.settings
+        if method.info.native and example.native is None or row not in names and unfit(method, example):
             continue
-        if row not in names and unfit(method, example):
-            continue
-        if variant.tuned and config.tune:
+        if VARIANTS[row].tuned and settings.evaluation.tune:
             if row not in kept:
                 on_step(f"tuning {row}")
-                kept[row] = tune(variant, config, validation)
-            settings[row] = kept[row]
-            method = variant.method(config, clamp=kept[row].clamp)
-            runners[row] = Runner(method, setting_variables(kept[row]), config.compiler_options)
-        elif owner:
-            entries = [stage.name for stage in stages_of(row, own_config)]
-            variables = {entry: trained[owner].variables[entry] for entry in entries}
-            runners[row] = Runner(method, variables, own_config.compiler_options)
+                kept[row] = tune(lambda clamp, member=member: _clamped(member, clamp), validation)
+            chosen[row] = kept[row]
+            method, variables = _clamped(member, kept[row].clamp), setting_variables(kept[row])
+        elif member.owner:
+            variables = {stage.name: trained[member.owner].variables[stage.name] for stage in member.stages}
         else:
-            runners[row] = Runner(method, method.init(jax.random.key(0), frames), config.compiler_options)
-    content = {row: setting._asdict() for row, setting in settings.items()}
-    write_json(out / "tuning.json", content)
-    return runners, settings
+            variables = method.init(jax.random.key(0), frames)
+        runners[row] = Runner(method, variables, settings.compiler_options)
+    write_json(out / "tuning.json", {row: setting._asdict() for row, setting in chosen.items()})
+    return runners, chosen
 
 
-def owner_of(row: str, names: Sequence[str], trained: Mapping[str, Trained]) -> str | None:
-    """The trained variant whose variables ``row`` runs with; None for a heuristic."""
-    if trained_as(row) in trained:
-        return trained_as(row)
-    whole = (trained_as(name) for name in names if row in VARIANTS[name].parts)
-    return next((name for name in whole if name in trained), None)
+def _clamped(member: Member, clamp: str) -> Method:
+    return VARIANTS[member.name].method(with_value(member.settings, "method.clamp", clamp))
 
 
 def unfit(method: Method, sequence: FrameSequence) -> str:
@@ -132,13 +118,12 @@ def unequal(info: MethodInfo, scale: int) -> str:
 _TIMES = {2: "twice", 4: "four times", 8: "eight times"}
 
 
-def _left_out(names: Sequence[str], sequence: FrameSequence, config: Config) -> list[str]:
+def _left_out(members: Mapping[str, Member], names: Sequence[str], sequence: FrameSequence) -> list[str]:
     """One remark per variant or baseline that does not fit the data."""
     remarks = []
-    for row in compared(names):
-        method = VARIANTS[row].method(config)
-        reason = unfit(method, sequence) if row not in names else ""
-        if method.info.native and sequence.native is None:
+    for row, member in members.items():
+        reason = unfit(member.method, sequence) if row not in names else ""
+        if member.method.info.native and sequence.native is None:
             reason = "this dataset has no colour at native resolution"
         if reason:
             remarks.append(f"No {row} row: {reason}.")
@@ -146,24 +131,25 @@ def _left_out(names: Sequence[str], sequence: FrameSequence, config: Config) -> 
 
 
 def notes(
-    names: Sequence[str], dataset: Dataset, clips: list[Clip], settings: dict[str, Setting], config: Config
+    members: Mapping[str, Member], names: Sequence[str], clips: Sequence[Clip], chosen: Mapping[str, Setting]
 ) -> list[str]:
     """What the reader of the table with the variants ``names`` must know."""
+    warmup = members[names[0]].settings.evaluation.warmup
     share = sum(clip.holes[clip.scored].mean() for clip in clips) / len(clips)
     exact = "exact, from the renderer" if clips[0].exact_holes else "estimated from the G-buffers"
     scored = sum(len(clip.scored) for clip in clips)
     recorded = all(clip.sequence.frames.exposure is not None for clip in clips)
     exposure = "recorded with the frames" if recorded else "0.18 over the log-mean of its reference, one per sequence"
     remarks = [
-        f"{scored} frames of {len(clips)} sequences are scored, each as SS and as ESS; {config.warmup} frames at the "
+        f"{scored} frames of {len(clips)} sequences are scored, each as SS and as ESS; {warmup} frames at the "
         f"start and after a cut warm up. Holes ({100 * share:.1f} % of LR pixels): {exact}. PSNR, SSIM of exposed "
         f"radiance after x/(1+x) and sRGB; exposure: {exposure}. HR results score against the anti-aliased reference, "
         "LR results against that frame's own jittered, aliased colour."
     ]
-    for row, setting in settings.items():
-        chosen = f"alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}"
-        remarks.append(f"{row}: {chosen}, the best on the validation frames ({setting.psnr:.2f} dB there).")
-    remarks += _left_out(names, clips[0].sequence, config)
+    for row, setting in chosen.items():
+        text = f"alpha {setting.alpha:g}, sigma {setting.sigma:g}, clamp {setting.clamp}"
+        remarks.append(f"{row}: {text}, the best on the validation frames ({setting.psnr:.2f} dB there).")
+    remarks += _left_out(members, names, clips[0].sequence)
     if not clips[0].exact_holes:
         remarks.append(_foreground_note())
     return remarks

@@ -5,50 +5,52 @@ from pathlib import Path
 from typing import Any
 
 from essjax.builtin import Clip, generate, plan
-from essjax.data import Dataset, read_dataset
-from experiments.config import Config
+from essjax.data import Dataset
+from experiments.settings import Settings
 
 ROUNDS = 10_000
 """Scenes per family that belong to one seed of a run."""
 
 
-def train_clips(config: Config, number: int = 0) -> list[Clip]:
+def train_clips(settings: Settings, number: int = 0) -> list[Clip]:
     """Round ``number`` of scenes to train on: 0 are those on disk, each further one (``fresh``) has new seeds.
 
     Runs with different seeds share no scene.
     """
-    start = config.seed * ROUNDS + number * config.train_sequences
-    return plan("train", config.train_sequences, config.train_frames, spp=config.train_spp, start=start)
+    data = settings.data
+    start = settings.seed * ROUNDS + number * data.train_sequences
+    return plan("train", data.train_sequences, data.train_frames, spp=data.train_spp, start=start)
 
 
-def scene_clips(config: Config) -> list[Clip]:
+def scene_clips(settings: Settings) -> list[Clip]:
     """The built-in scenes of a run: of all splits."""
+    data = settings.data
     return [
-        *train_clips(config),
-        *plan("validation", config.validation_sequences, config.test_frames, spp=config.train_spp, native=True),
-        *plan("test", config.test_sequences, config.test_frames, spp=config.test_spp, native=True),
+        *train_clips(settings),
+        *plan("validation", data.validation_sequences, data.test_frames, spp=data.train_spp, native=True),
+        *plan("test", data.test_sequences, data.test_frames, spp=data.test_spp, native=True),
     ]
 
 
-def render_settings(config: Config) -> dict[str, Any]:
+def render_settings(settings: Settings) -> dict[str, Any]:
     """Of the built-in renderer, for all splits."""
-    return {"scale": config.scale, "mip_bias": config.mip_bias, "jitter": config.jitter}
+    return {"scale": settings.data.scale, "mip_bias": settings.data.mip_bias, "jitter": settings.data.jitter}
 
 
 def prepare(
-    config: Config,
-    data: str | None,
+    settings: Settings,
+    data: Dataset | None,
     out: Path,
     progress: Callable[[int, int], None],
     *,
     ranges: bool = False,
     native: bool = False,
 ) -> Dataset:
-    """Open ``data``, or render the built-in scenes into ``out / "scenes"`` (resumes; complete frames are kept).
+    """Check ``data``, or render the built-in scenes into ``out / "scenes"`` (resumes; complete frames are kept).
 
     Args:
-      config: the run's settings.
-      data: a dataset's folder, or None to render.
+      settings: of the run.
+      data: a dataset that the user names, or None to render.
       out: the run's folder.
       progress: called with frames done and in all.
       ranges: the run needs sample ranges.
@@ -58,11 +60,10 @@ def prepare(
       ValueError: the dataset lacks a split, ranges or colour that a run needs, or was rendered with other settings.
     """
     if data is not None:
-        dataset = read_dataset(data)
+        dataset = data
     else:
-        width, height = config.size
-        settings = {**render_settings(config), "ranges": ranges}
-        dataset = generate(out / "scenes", scene_clips(config), width, height, progress=progress, **settings)
+        options = {**render_settings(settings), "ranges": ranges}
+        dataset = generate(out / "scenes", scene_clips(settings), *settings.data.size, progress=progress, **options)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):
             raise ValueError(

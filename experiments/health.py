@@ -70,7 +70,7 @@ def few_steps(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """A warning for each stage that ended too soon to have learned much."""
     return [
         f"{stage} made only {_steps(found['steps'])}: too few to learn much, so its numbers say little. Give it more "
-        "with --set seconds=N first_seconds=N (or steps=N first_steps=N), or a faster or less busy machine."
+        f"with --set {stage.split('/')[-1]}.seconds=N (or .steps=N), or a faster or less busy machine."
         for stage, found in reports.items()
         if has_few_steps({stage: found})
     ]

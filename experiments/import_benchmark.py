@@ -4,8 +4,6 @@ Makes a dump of 960x540 frames (15 channels, as Unreal or Blender would write th
 without and with a 1920x1080 reference, and writes ``experiments/results/import.json``.
 """
 
-import argparse
-import json
 import os
 import resource
 import shutil
@@ -16,8 +14,10 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
+import tyro
 
 from essjax.data import import_dataset
+from essjax.data.layout import write_json
 from experiments.benchmarks_page import RESULTS
 
 WIDTH, HEIGHT, DISTINCT = 960, 540, 8
@@ -117,31 +117,31 @@ def measure(folder: Path, frames: int, *, with_reference: bool, workers: int) ->
     }
 
 
-def main() -> None:
-    """Measure both cases and write the results."""
-    parser = argparse.ArgumentParser(
-        "python -m experiments.import_benchmark", description="Speed and memory of import."
-    )
-    parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument(
-        "--folder", type=Path, help="where the dump and the dataset go for the while (default: temporary)"
-    )
-    parser.add_argument("--out", type=Path, default=RESULTS / "import.json")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=options.folder) as temporary:
-        folder = Path(temporary)
-        make_dump(folder, options.frames)
+def main(
+    *,
+    frames: int = 1000,
+    workers: int = os.cpu_count() or 1,
+    folder: Path | None = None,
+    out: Path = RESULTS / "import.json",
+) -> None:
+    """Measure speed and memory of an import, and write the results.
+
+    Args:
+      frames: of the dump.
+      workers: threads.
+      folder: where the dump and the dataset go for the while; a temporary one without it.
+      out: file of the results.
+    """
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        make_dump(Path(temporary), frames)
         load, cases = os.getloadavg()[0], {}
         for name, with_reference in (("960x540, no reference", False), ("960x540 and a 1920x1080 reference", True)):
-            cases[name] = measure(folder, options.frames, with_reference=with_reference, workers=options.workers)
+            cases[name] = measure(Path(temporary), frames, with_reference=with_reference, workers=workers)
             print(name, {k: v for k, v in cases[name].items() if k != "resident_megabytes"})
             print("  memory, MB:", *cases[name]["resident_megabytes"])
-    machine = f"{os.cpu_count()} CPU cores, {options.workers} threads, load {load:.1f} from other work at the start"
-    options.out.write_text(
-        json.dumps({"schema": 1, "kind": "import", "machine": machine, "cases": cases}, indent=1) + "\n"
-    )
+    machine = f"{os.cpu_count()} CPU cores, {workers} threads, load {load:.1f} from other work at the start"
+    write_json(out, {"schema": 1, "kind": "import", "machine": machine, "cases": cases})
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, prog="python -m experiments.import_benchmark")

@@ -1,7 +1,7 @@
 """``--profile``: a JAX profiler trace of the train step and of the streaming steps."""
 
-import dataclasses
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -10,34 +10,30 @@ from rich.console import Console
 from essjax.builtin import generate, plan
 from essjax.frames import select_time
 from essjax.rollout import ESS, SS, stream
-from essjax.train import OPTIMIZERS, create_state, make_train_step
-from experiments.config import Config
+from experiments.members import resolve, settings_of
+from experiments.settings import with_value
 from experiments.trace import describe, operations
-from experiments.training import initial_variables, make_batches
-from experiments.variants import get_variant, stages_of
+from experiments.training import initial_state, initial_variables, make_batches, make_step
 
 
-def write_profile(name: str, config: Config, out: Path, console: Console, *, repetitions: int = 5) -> int:
+def write_profile(
+    name: str, preset: str, overrides: Sequence[str], out: Path, console: Console, *, repetitions: int = 5
+) -> int:
     """Trace ``repetitions`` train steps of the last stage and as many SS/ESS pairs; compilation is not in the trace."""
-    variant = get_variant(name)
-    clips = plan("train", 1, max(config.clip, 3), spp=1, families=["carousel"])
-    dataset = generate(out / "profile-scenes", clips, *config.size, scale=config.scale)
-    folder = out / "profile"
-    stages = stages_of(name, config)
+    settings = with_value(settings_of(name, preset, overrides), "data.fresh", None)
+    member, folder = resolve({name: settings}, preset, out)[name], out / "profile"
+    stages, method = member.stages, member.method
+    clips = plan("train", 1, max([3, *(stage.settings.clip for stage in stages)]), spp=1, families=["carousel"])
+    dataset = generate(out / "profile-scenes", clips, *settings.data.size, scale=settings.data.scale)
     if stages:
         stage = stages[-1]
-        variables = initial_variables(stages, dataset, config)
-        transform = OPTIMIZERS[config.optimizer]()
-        step = make_train_step(stage.objective, transform, stage.name)
-        state, batch = (
-            create_state(variables, stage.name, transform),
-            next(make_batches(dataset, dataclasses.replace(config, fresh=None), stage)),
-        )
-        state, _ = step(state, batch, stage.learning_rate)
+        variables = initial_variables(member, dataset)
+        step, batch = make_step(stage, settings), next(make_batches(dataset, settings, stage))
+        state = initial_state(member, stage, variables, batch)
+        state, _ = step(state, batch, stage.settings.learning_rate)
         method, frames = stage.method, jax.tree.map(lambda leaf: leaf[:, :1], batch.frames)
         variables = state.variables
     else:
-        method = variant.method(config)
         from essjax.data import disk_source
 
         frames = jax.tree.map(lambda leaf: leaf[:, None], disk_source(dataset, "train")[0].frames)
@@ -55,7 +51,7 @@ def write_profile(name: str, config: Config, out: Path, console: Console, *, rep
         if stages:
             for repetition in range(repetitions):
                 with jax.profiler.StepTraceAnnotation("train", step_num=repetition):
-                    state, terms = step(state, batch, stage.learning_rate)
+                    state, terms = step(state, batch, stage.settings.learning_rate)
                     jax.block_until_ready(terms)
     for line in describe(operations(folder)):
         console.print(line, soft_wrap=True, highlight=False, markup=False)

@@ -1,52 +1,86 @@
 """``python -m experiments.run --variant NAME``: render or read data, train, evaluate against baselines, report."""
 
-import argparse
 import dataclasses
+import itertools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from rich.console import Console
 from rich.text import Text
 
-from experiments.config import PRESET_NAMES
+from experiments.settings import PRESETS
+
+Folder = Annotated[str | None, tyro.conf.arg(metavar="DIR")]
 
 
-def shared_options(parser: argparse.ArgumentParser) -> None:
-    """Add what ``run`` and ``compare`` have in common."""
-    parser.add_argument("--data", metavar="DIR", help="an essjax dataset; without it the built-in scenes are rendered")
-    parser.add_argument("--preset", default="quick", help=f"one of {', '.join(PRESET_NAMES)} (default: quick)")
-    parser.add_argument("--set", dest="overrides", metavar="KEY=VALUE", nargs="+", action="extend", default=[])
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted run in --out")
-    parser.add_argument("--eval-only", action="store_true", help="evaluate the checkpoint in --out, no training")
-    parser.add_argument(
-        "--tensorboard",
-        action="store_true",
-        help="write TensorBoard events (needs tensorboardX)",
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What ``run``, ``compare`` and ``tables`` have in common."""
+
+    data: Folder = None
+    """an essjax dataset; without it the built-in scenes are rendered"""
+    preset: Annotated[str, tyro.conf.arg(help=f"one of {', '.join(PRESETS)}")] = "quick"
+    set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.arg(metavar="PATH=VALUE ..."), tyro.conf.UseAppendAction] = ()
+    """settings, such as method.width=24 frnet.seconds=60, of one variant alone VARIANT:PATH=VALUE"""
+    resume: bool = False
+    """continue an interrupted run in --out"""
+    eval_only: bool = False
+    """evaluate the checkpoint in --out, no training"""
+    tensorboard: bool = False
+    """write TensorBoard events (needs tensorboardX)"""
+    list: bool = False
+    """list what can be named and stop"""
+    compilation_cache: bool = True
+    """compile everything anew instead of keeping programs in ~/.cache/essjax"""
+    out: Folder = None
+    """where results go; without it runs/NAME-PRESET[-DATA]"""
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """Of all ``--set``."""
+        return tuple(itertools.chain(*self.set))
+
+    def run(self, names: Sequence[str], out: Path, console: Console, more: Sequence[str] = ()) -> dict[str, Any]:
+        """Train and evaluate ``names`` in ``out``, with ``more`` settings before those of the command line."""
+        # Imported here, as below: a typing error in the command line should not wait for JAX.
+        from experiments.cache import keep_programs
+        from experiments.experiment import run_experiment
+        from experiments.request import Request
+
+        keep_programs(self.compilation_cache)
+        overrides = (*more, *self.overrides)
+        request = Request(
+            tuple(names), self.preset, overrides, self.data, out, self.resume, self.eval_only, self.tensorboard
+        )
+        return run_experiment(request, console)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions(Options):
+    """Train a variant, evaluate it against baselines, write a report."""
+
+    variant: str = "extrass"
+    """what to run; --list shows all"""
+    profile: bool = False
+    """write a JAX profiler trace of train and streaming steps"""
+
+
+def parse_as(kind: type, command: str, arguments: Sequence[str] | None) -> Any:
+    """The command line of ``python -m experiments.COMMAND`` as a ``kind``."""
+    return tyro.cli(
+        kind, prog=f"python -m experiments.{command}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
-    parser.add_argument("--list", action="store_true", help="list the variants and stop")
-    parser.add_argument(
-        "--no-compilation-cache", dest="compilation_cache", action="store_false",
-        help="compile everything anew instead of keeping programs in ~/.cache/essjax",
-    )  # fmt: skip
 
 
-def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None = None) -> RunOptions:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        "python -m experiments.run", description="Train a variant, evaluate it against baselines, write a report."
-    )
-    parser.add_argument("--variant", default="extrass", help="what to run; --list shows all (default: extrass)")
-    parser.add_argument("--out", metavar="DIR", help="where results go (default: runs/VARIANT-PRESET[-DATA])")
-    parser.add_argument(
-        "--profile", action="store_true", help="write a JAX profiler trace of train and streaming steps"
-    )
-    shared_options(parser)
-    return parser.parse_args(arguments)
+    return parse_as(RunOptions, "run", arguments)
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; bad input prints one line and returns 2, a signal 130, a run with a dead network 1."""
     options = parse(arguments)
     return guarded(lambda console: _run(options, console))
@@ -82,37 +116,26 @@ def exit_code(metrics: Mapping[str, Any], console: Console) -> int:
 
 def print_variants(console: Console) -> int:
     """What ``--list`` prints."""
-    from experiments.variants import describe
+    from experiments.variants import VARIANTS
 
-    summaries = describe()
-    width = max(len(name) for name in summaries)
-    for name, summary in summaries.items():
-        console.print(f"  [bold]{name:<{width}}[/bold] {summary}", soft_wrap=True)
+    width = max(len(name) for name in VARIANTS)
+    for name, variant in VARIANTS.items():
+        console.print(f"  [bold]{name:<{width}}[/bold] {variant.summary}", soft_wrap=True)
     return 0
 
 
-def _run(options: argparse.Namespace, console: Console) -> int:
-    # Imported here: a typing error in the command line should not wait for JAX.
-    from experiments.cache import keep_programs
-    from experiments.experiment import check_folder, default_folder, run_experiment
-    from experiments.profile import write_profile
-    from experiments.variants import config_of
+def _run(options: RunOptions, console: Console) -> int:
+    from experiments.request import default_folder
 
     if options.list:
         return print_variants(console)
-    keep_programs(options.compilation_cache)
     name = options.variant
-    config = config_of(name, options.preset, options.overrides)
     out = Path(options.out) if options.out else default_folder(name, options.preset, options.data)
     if options.profile:
-        return write_profile(name, config, out, console)
-    wanted = {"variant": name, "data": options.data, **dataclasses.asdict(config)}
-    check_folder(out, wanted, resume=options.resume, eval_only=options.eval_only)
-    metrics = run_experiment(
-        [name], {name: config}, {name: out}, preset=options.preset, overrides=options.overrides, data=options.data,
-        out=out, wanted=wanted, eval_only=options.eval_only, console=console, tensorboard=options.tensorboard,
-    )  # fmt: skip
-    return exit_code(metrics, console)
+        from experiments.profile import write_profile
+
+        return write_profile(name, options.preset, options.overrides, out, console)
+    return exit_code(options.run([name], out, console), console)
 
 
 if __name__ == "__main__":

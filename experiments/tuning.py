@@ -1,7 +1,7 @@
 """Choose the settings of the TAA family on validation frames: a baseline is only worth beating at its best."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -14,9 +14,7 @@ from essjax.interfaces import Method
 from essjax.metrics import has_source, psnr
 from essjax.rollout import stream
 from essjax.typing import Array
-from experiments.config import Config
 from experiments.evaluate import Clip, batches, schedules
-from experiments.variants.base import Variant
 
 ALPHAS = (0.1, 0.2, 0.4, 0.7, 1.0)
 SIGMAS = (0.4, 0.5, 0.65, 0.8, 1.0)  # as many: one compilation serves both
@@ -34,14 +32,14 @@ class Setting(NamedTuple):
     psnr: float
 
 
-def tune(variant: Variant, config: Config, clips: Sequence[Clip]) -> Setting:
-    """For each clamp the best alpha, then for it the best sigma; returns the best of all.
+def tune(make: Callable[[str], Method], clips: Sequence[Clip]) -> Setting:
+    """For each clamp (of which ``make`` gives the method) the best alpha, then for it the best sigma; the best of all.
 
     A clamp replaces the first one only if it gains more than the standard error of the gain over the clips: what a few
     clips choose by chance costs more on others than it gained.
     """
     with ThreadPoolExecutor(len(CLAMPS)) as pool:  # each compiles steps of its own, which is most of the time
-        (chosen, scores), *others = pool.map(functools.partial(_tune_clamp, variant, config, clips), CLAMPS)
+        (chosen, scores), *others = pool.map(functools.partial(_tune_clamp, make, clips), CLAMPS)
     for other, other_scores in others:
         gain = other_scores - scores
         if gain.mean() > (gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0):
@@ -49,8 +47,8 @@ def tune(variant: Variant, config: Config, clips: Sequence[Clip]) -> Setting:
     return chosen
 
 
-def _tune_clamp(variant: Variant, config: Config, clips: Sequence[Clip], clamp: str) -> tuple[Setting, np.ndarray]:
-    method = variant.method(config, clamp=clamp)
+def _tune_clamp(make: Callable[[str], Method], clips: Sequence[Clip], clamp: str) -> tuple[Setting, np.ndarray]:
+    method = make(clamp)
     first, _ = _best(method, clamp, [(alpha, FIRST_SIGMA) for alpha in ALPHAS], clips)
     return _best(method, clamp, [(first.alpha, sigma) for sigma in SIGMAS], clips)
 

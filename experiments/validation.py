@@ -13,8 +13,8 @@ from essjax.interfaces import Method
 from essjax.metrics import psnr
 from essjax.rollout import alternate, every
 from essjax.typing import Array, PyTree
-from experiments.config import Config
 from experiments.evaluate import Runner, scored_frames, shown_exposure
+from experiments.settings import Settings
 
 SPLIT = "validation"
 CLIPS = 8
@@ -30,11 +30,11 @@ class Window(NamedTuple):
     scored: list[int]
 
 
-def windows(dataset: Dataset, config: Config, *, native: bool) -> list[Window]:
+def windows(dataset: Dataset, settings: Settings, *, native: bool) -> list[Window]:
     """What is played: of up to ``CLIPS`` clips the first frames that are scored, and as many before as warm up."""
     source, segments = disk_source(dataset, SPLIT, native=native), dataset.segments(SPLIT)
     chosen = sorted(set(np.linspace(0, len(segments) - 1, CLIPS).round().astype(int).tolist()))
-    found = [_window(source, index, dataset.scored(segments[index]), config.warmup) for index in chosen]
+    found = [_window(source, index, dataset.scored(segments[index]), settings.evaluation.warmup) for index in chosen]
     return [window for window in found if window.scored]
 
 
@@ -49,9 +49,9 @@ def _window(source: DiskSource, index: int, counted: np.ndarray, warmup: int) ->
 class Scorer:
     """PSNR of a method on the windows, as evaluation has it: after x/(1+x) and sRGB, both kinds of frames."""
 
-    def __init__(self, method: Method, dataset: Dataset, config: Config):
+    def __init__(self, method: Method, dataset: Dataset, settings: Settings):
         """Nothing is read or compiled before the first score is asked for."""
-        self._method, self._dataset, self._config = method, dataset, config
+        self._method, self._dataset, self._settings = method, dataset, settings
         self._windows: list[Window] = []
         self._runner: Runner | None = None
 
@@ -59,8 +59,8 @@ class Scorer:
         """Kind of frame -> mean PSNR over its scored frames, dB; of the kinds that the method predicts."""
         info = self._method.info
         if self._runner is None:
-            self._windows = windows(self._dataset, self._config, native=info.native)
-            self._runner = Runner(self._method, variables, self._config.compiler_options)
+            self._windows = windows(self._dataset, self._settings, native=info.native)
+            self._runner = Runner(self._method, variables, self._settings.compiler_options)
         self._runner.variables = variables
         schedule = every() if info.renders_all else alternate(0)
         values: dict[str, list[float]] = {}

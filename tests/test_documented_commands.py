@@ -24,8 +24,8 @@ from essjax.data.importing import PRESETS
 from essjax.data.importing.recipe import load_recipe
 from experiments import compare, run, tables
 from experiments.benchmark import __main__ as benchmark
+from experiments.members import all_settings
 from experiments.tables import __main__ as tables_command
-from experiments.variants import config_of
 from tests.test_cli import instant_renderer  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,18 +98,18 @@ def check_essjax(arguments):
 
 def check_run(arguments):
     options = run.parse(arguments)
-    config_of(options.variant, options.preset, options.overrides)
+    all_settings([options.variant], options.preset, options.overrides)
 
 
 def check_compare(arguments):
     options = compare.parse(arguments)
-    assert all(config_of(name, options.preset, options.overrides) for name in options.variants.split(","))
+    assert all_settings(options.variants.split(","), options.preset, options.overrides)
 
 
 def check_tables(arguments):
     options = tables_command.parse(arguments)
     assert all(tables.get_table(name) for name in options.names)
-    config_of("extrass", options.preset, options.overrides)
+    assert all_settings(["extrass"], options.preset, options.overrides)
 
 
 def check_benchmark(arguments):
@@ -170,7 +170,7 @@ def test_the_commands_are_found():
     ("words", "message"),
     [
         (("python", "-m", "experiments.run", "--variant", "extras"), "unknown variant 'extras'"),
-        (("python", "-m", "experiments.run", "--set", "widht=24"), "unknown key 'widht'"),
+        (("python", "-m", "experiments.run", "--set", "widht=24"), "unknown setting 'widht'"),
         (("essjax", "scenes", "OUT", "--families", "forest"), "got 'forest'"),
         (("pip", "install", "-e", ".[bench,torch]"), "no extra"),
         (("python", "-m", "experiments.score"), "no module"),

@@ -1,41 +1,53 @@
 """``python -m experiments.benchmark [--suite warp ...]``: time everything and keep the results."""
 
-import argparse
+import dataclasses
 import datetime
 import os
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from rich.console import Console
 
 from experiments.benchmark.schema import SIZE
-from experiments.run import print_error
+from experiments.run import parse_as, print_error
 
 SUITES = ("warp", "networks", "pipeline", "train", "scenes")
 
 
-def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Time essjax and its peers; results go to experiments/results."""
+
+    suite: tuple[str, ...] = SUITES
+    """some of warp, networks, pipeline, train, scenes"""
+    device: str | None = None
+    """cpu or gpu; JAX's choice without it"""
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = SIZE
+    """of low-resolution frames"""
+    repetitions: int = 20
+    """of each case"""
+    frames: int = 300
+    """streamed by the pipeline suite"""
+    dtypes: tuple[str, ...] = ("float32", "bfloat16")
+    """of networks"""
+    only: tuple[str, ...] = ()
+    """cases that begin so, for example: extrass guided"""
+    peers: bool = True
+    """only essjax, even where PyTorch is installed"""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """where results go; experiments/results without it"""
+
+
+def parse(arguments: Sequence[str] | None = None) -> Command:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        "python -m experiments.benchmark", description="Time essjax and its peers; results go to experiments/results."
-    )
-    parser.add_argument("--suite", nargs="+", default=list(SUITES), metavar="NAME", help=f"of {', '.join(SUITES)}")
-    parser.add_argument("--device", help="cpu or gpu (default: JAX's choice)")
-    parser.add_argument("--size", default=SIZE, metavar="WxH", help=f"of low-resolution frames (default: {SIZE})")
-    parser.add_argument("--repetitions", type=int, default=20, help="of each case (default: 20)")
-    parser.add_argument("--frames", type=int, default=300, help="streamed by the pipeline suite (default: 300)")
-    parser.add_argument(
-        "--dtypes", nargs="+", default=["float32", "bfloat16"], help="of networks (default: float32 bfloat16)"
-    )
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="cases that begin so, for example: extrass guided")
-    parser.add_argument("--no-peers", action="store_true", help="only essjax, even where PyTorch is installed")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where results go (default: experiments/results)")
-    return parser.parse_args(arguments)
+    return parse_as(Command, "benchmark", arguments)
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; bad input prints one line and returns 2."""
     options, console = parse(arguments), Console()
     try:
@@ -52,7 +64,7 @@ def _size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _benchmark(options: argparse.Namespace, console: Console) -> int:
+def _benchmark(options: Command, console: Console) -> int:
     width, height = _size(options.size)
     unknown = [name for name in options.suite if name not in SUITES]
     if unknown:
@@ -72,14 +84,13 @@ def _benchmark(options: argparse.Namespace, console: Console) -> int:
     # Imported here: a typing error should not wait for JAX, and JAX reads its platform once.
     import jax
 
+    from essjax.data.layout import write_json
     from experiments.benchmark import machine, schema, suites
     from experiments.benchmarks_page import RESULTS
     from experiments.environment import environment
-    from experiments.experiment import write_json
 
     settings = suites.Options(
-        width, height, options.repetitions, options.frames, not options.no_peers, tuple(options.dtypes),
-        tuple(options.only or ()),
+        width, height, options.repetitions, options.frames, options.peers, options.dtypes, options.only,
     )  # fmt: skip
     out, load_average = options.out or RESULTS, os.getloadavg()[0]
     out.mkdir(parents=True, exist_ok=True)

@@ -20,9 +20,9 @@ class _Data(NamedTuple):
     half_input: bool = False
 
 
-_FOUR = _Data("4x4", "4x4, dataset 1", ("scale=4", "jitter=dlctus"), half_input=True)
-_TWO = _Data("2x2", "2x2, dataset 1", ("jitter=dlctus",))
-_SHARP = _Data("2x2-sharp", "2x2, dataset 2", ("jitter=dlctus", "mip_bias=-1.0"))
+_FOUR = _Data("4x4", "4x4, dataset 1", ("data.scale=4", "data.jitter=dlctus"), half_input=True)
+_TWO = _Data("2x2", "2x2, dataset 1", ("data.jitter=dlctus",))
+_SHARP = _Data("2x2-sharp", "2x2, dataset 2", ("data.jitter=dlctus", "data.mip_bias=-1.0"))
 
 
 def _table(

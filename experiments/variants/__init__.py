@@ -1,10 +1,7 @@
 """What ``--variant`` can name, by paper, and what a run compares it with."""
 
-import dataclasses
 from collections.abc import Sequence
 
-from essjax.train import constant
-from experiments.config import Config, make_config
 from experiments.variants import baselines, classifier, dlctus, extranet, extrass, fasset, interpolation, nsrr
 from experiments.variants.base import Stage, Variant
 
@@ -36,24 +33,8 @@ def get_variant(name: str) -> Variant:
 
 
 def trained_as(name: str) -> str:
-    """The variant whose training ``name`` takes: its own, unless only its steps differ."""
+    """The variant whose training and settings ``name`` takes: its own, unless only its steps differ."""
     return get_variant(name).weights or name
-
-
-def stages_of(name: str, config: Config) -> list[Stage]:
-    """The training stages behind a variant; without ``config.anneal`` their learning rates do not decay."""
-    stages = get_variant(trained_as(name)).stages(config)
-    return stages if config.anneal else [dataclasses.replace(stage, decay=constant) for stage in stages]
-
-
-def config_of(name: str, preset: str, overrides: list[str]) -> Config:
-    """The settings of a run of ``name``: the preset, what the variant changes in it, then ``--set``."""
-    variant = get_variant(trained_as(name))
-    config = make_config(preset, overrides, variant.presets)
-    if preset not in variant.crops or any(override.startswith("crop=") for override in overrides):
-        return config
-    side = variant.crops[preset] // config.scale
-    return dataclasses.replace(config, crop=(side, side))
 
 
 def compared(names: Sequence[str]) -> tuple[str, ...]:
@@ -62,6 +43,4 @@ def compared(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(n for n in dict.fromkeys((*BASELINES, *parts)) if n not in names) + tuple(dict.fromkeys(names))
 
 
-def describe() -> dict[str, str]:
-    """Name -> summary, for ``--list``."""
-    return {name: variant.summary for name, variant in VARIANTS.items()}
+__all__ = ["BASELINES", "VARIANTS", "Stage", "Variant", "compared", "get_variant", "trained_as"]

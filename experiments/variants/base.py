@@ -1,39 +1,98 @@
-"""What a variant is: a method with its training stages."""
+"""What a variant is: a method with its training, and what ``docs/methods.md`` says about it."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from essjax.interfaces import Method
-from essjax.train import Budget, Objective, cosine
-from experiments.config import Config
+from essjax.train import Budget, Objective, Recurrent, constant, cosine
+from experiments.settings import Settings, StageSettings, Table, arguments, make_settings
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """One training stage of a variant.
+    """One training stage, ready to be run.
 
     Attributes:
       name: also the entry of the variables that it trains; the others are frozen.
-      method: the method that is unrolled.
+      method: the method that is validated.
       objective: what is minimised.
-      batch: clips per step.
-      learning_rate: its peak.
-      budget: when it ends.
-      decay: of the learning rate, ``progress -> factor``, unless ``Config.anneal`` is false.
+      settings: batch, crop, learning rate, budget.
+      decay: of the learning rate, ``progress -> factor``.
       ranges: its objective needs the clips' sample ranges.
-      vgg: its loss has a perceptual term, which needs the weights that ``Config.vgg`` names.
+      vgg: its loss has a perceptual term, which needs the weights that ``training.vgg`` names.
     """
 
     name: str
     method: Method
-    objective: Objective
-    batch: int
-    learning_rate: float
-    budget: Budget
+    objective: Objective | Recurrent
+    settings: StageSettings
+    decay: Callable[[float], float]
+    ranges: bool
+    vgg: bool
+
+    @property
+    def budget(self) -> Budget:
+        """When it ends."""
+        return Budget(self.settings.steps, self.settings.seconds)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """How one entry of a method's variables is trained.
+
+    Attributes:
+      objective: ``(method, **arguments) -> Objective``; arguments with defaults that are plain values are settings.
+      method: of the run's settings, where it is not the variant's own: a part that is trained first.
+      unrolls: the same, where the objective's method is not the one that holds the variables.
+      given: arguments of the objective that are no settings, from the run's settings.
+      decay: of the learning rate, unless ``training.anneal`` is false.
+      ranges: see ``Stage``.
+      vgg: ``path -> features``, for an objective that takes ``vgg_features``.
+    """
+
+    objective: Callable[..., Any]
+    method: Callable[[Settings], Method] | None = None
+    unrolls: Callable[[Settings], Method] | None = None
+    given: Callable[[Settings], Mapping[str, Any]] = lambda settings: {}
     decay: Callable[[float], float] = cosine
     ranges: bool = False
-    vgg: bool = False
+    vgg: Callable[[str], Any] | None = None
+
+    def stage(self, name: str, settings: Settings, whole: Method) -> Stage:
+        """The stage called ``name`` of a variant whose method is ``whole``."""
+        method = self.method(settings) if self.method else whole
+        given = {**vars(settings.stages[name].loss), **self.given(settings)}
+        if self.vgg and settings.training.vgg:
+            given["vgg_features"] = self.vgg(settings.training.vgg)
+        objective = self.objective(self.unrolls(settings) if self.unrolls else method, **given)
+        decay = self.decay if settings.training.anneal else constant
+        return Stage(name, method, objective, settings.stages[name], decay, self.ranges, self.vgg is not None)
+
+
+class Page(NamedTuple):
+    """What docs/methods.md says about a method and cannot be computed.
+
+    Attributes:
+      paper: where it comes from.
+      idea: one or two sentences.
+      chosen: what the paper does not say and what we chose, in short.
+      reactive: what becomes of a reactive pixel in an extrapolated frame.
+    """
+
+    paper: str
+    idea: str
+    chosen: str = "–"
+    reactive: str = "–"
+
+
+class Found(NamedTuple):
+    """What a variant measures beyond images: ``scores`` for ``metrics.json``, ``remark`` for the reader."""
+
+    scores: Mapping[str, Any]
+    remark: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,30 +101,46 @@ class Variant:
 
     Attributes:
       summary: one line for ``--list``.
-      method: from the settings of a run.
+      factory: of its method; its arguments that are plain values with defaults are the settings ``method.*``.
       stages: its training, in order; none for a heuristic. Each stage's variables contain those of the stages before.
+      presets: path of a setting -> its value in each preset, on top of ``settings.COMMON``.
+      page: its row in docs/methods.md; ablations have none.
       tuned: its alpha, sigma and clamp are chosen on the validation frames.
-      weights: the variant whose training it takes, where only its steps differ; then ``stages`` is that one's.
-      parts: variants whose variables it contains: a run shows their rows too.
-      presets: preset -> settings of the training (``Config``) that this variant changes.
-      crops: preset -> side of its crops in *output* pixels, where a paper gives it so: ``crop`` then follows ``scale``.
+      weights: the variant whose training and settings it takes, where only its steps differ.
+      parts: variants whose variables it contains, each with its arguments that are called otherwise here (its name ->
+        ours): a run shows their rows too.
+      inspect: measures more than images, on the test clips, and may write pictures into the report's folder;
+        what its ``key`` says are its ``Found.scores`` in ``metrics.json``.
+      key: of ``inspect``.
     """
 
     summary: str
-    method: Callable[..., Method]
-    stages: Callable[[Config], list[Stage]] = lambda config: []
+    factory: Callable[..., Method]
+    stages: Mapping[str, Recipe] = dataclasses.field(default_factory=dict)
+    presets: Table = dataclasses.field(default_factory=dict)
+    page: Page | None = None
     tuned: bool = False
     weights: str | None = None
-    parts: tuple[str, ...] = ()
-    presets: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    crops: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    parts: Mapping[str, Mapping[str, str]] = dataclasses.field(default_factory=dict)
+    inspect: Callable[[Method, Any, Sequence, Settings, Path], Found | None] | None = None
+    key: str = ""
 
+    def settings(self, preset: str, overrides: Mapping[str, Any]) -> Settings:
+        """Those of a run: see ``make_settings``."""
+        objectives = {name: recipe.objective for name, recipe in self.stages.items()}
+        return make_settings(preset, overrides, method=self.factory, objectives=objectives, table=self.presets)
 
-def main_budget(config: Config) -> Budget:
-    """When the last (or only) stage ends."""
-    return Budget(config.steps, config.seconds)
+    def method(self, settings: Settings, renamed: Mapping[str, str] | None = None) -> Method:
+        """Its method from settings, its own or those of a variant that holds its variables.
 
-
-def first_budget(config: Config) -> Budget:
-    """When the stage before it ends."""
-    return Budget(config.first_steps, config.first_seconds)
+        Args:
+          settings: those arguments that they do not have keep the factory's defaults.
+          renamed: argument -> what it is called there.
+        """
+        theirs = {name: (renamed or {}).get(name, name) for name in arguments(self.factory).__dataclass_fields__}
+        given = {
+            name: getattr(settings.method, there) for name, there in theirs.items() if hasattr(settings.method, there)
+        }
+        if "scale" in inspect.signature(self.factory).parameters:
+            given["scale"] = settings.data.scale
+        return self.factory(**given)

@@ -1,54 +1,75 @@
 """ExtraSS (SIGGRAPH Asia 2023) and its parts."""
 
 from essjax import methods
-from essjax.interfaces import Method
 from essjax.losses import vgg16_features
 from essjax.train import extrass_objective, frnet_objective
-from experiments.config import Config
-from experiments.variants.base import Stage, Variant, first_budget, main_budget
+from experiments.settings import Settings
+from experiments.variants.base import Page, Recipe, Variant
+
+FRNET = {
+    #                       smoke quick paper
+    "frnet.learning_rate": (1e-3, 1e-3, 1e-4),
+    "frnet.steps":         (4,    None, 100 * 900),
+    "frnet.seconds":       (None, 45.0, None),
+}  # fmt: skip
+LOW = {"width": "frnet_width"}
+"""The low-resolution part's arguments, in the whole."""
 
 
-def _extrass_e(config: Config) -> Method:
-    return methods.extrass_e(width=config.first_width)
-
-
-def _extrass(config: Config) -> Method:
-    return methods.extrass(width=config.width, frnet_width=config.first_width, scale=config.scale)
-
-
-def _frnet_stage(config: Config) -> Stage:
-    method = _extrass_e(config)
-    return Stage(
-        "frnet",
-        method,
-        frnet_objective(method, feature_weight=config.feature_weight),
-        config.first_batch,
-        config.first_learning_rate,
-        first_budget(config),
-    )
-
-
-def _extrass_stage(config: Config) -> Stage:
-    method = _extrass(config)
-    objective = extrass_objective(
-        method,
-        occlusion_weight=config.occlusion_weight,
-        vgg_weight=config.vgg_weight,
-        temporal_weight=config.temporal_weight,
-        vgg_features=vgg16_features(config.vgg) if config.vgg else None,
-    )
-    return Stage("extrassnet", method, objective, config.batch, config.learning_rate, main_budget(config), vgg=True)
+def _low(settings: Settings):
+    return VARIANTS["extrass-e"].method(settings, LOW)
 
 
 VARIANTS = {
     "extrass": Variant(
         "ExtraSS: G-buffer guided warp, FRNet, ExtraSSNet; every frame at twice the size from half of the frames",
-        _extrass,
-        lambda config: [_frnet_stage(config), _extrass_stage(config)],
-        parts=("extrass-e",),
+        methods.extrass,
+        {
+            "frnet": Recipe(frnet_objective, method=_low),
+            "extrassnet": Recipe(extrass_objective, vgg=vgg16_features),
+        },
+        {
+            #                                    smoke quick  paper
+            "method.width":                     (8,    16,    24),
+            "method.frnet_width":               (8,    16,    24),
+            **FRNET,
+            "extrassnet.batch":                 (2,    4,     12),
+            "extrassnet.learning_rate":         (3e-3, 3e-3,  4e-4),
+            "extrassnet.steps":                 (6,    None,  120 * 600),
+            "extrassnet.seconds":               (None, 245.0, None),
+            "extrassnet.loss.occlusion_weight": (0.3,  0.3,   1.0),
+            "extrassnet.loss.temporal_weight":  (0.1,  0.1,   1.0),
+        },
+        parts={"extrass-e": LOW},
+        page=Page(
+            "ExtraSS 2023",
+            "G-buffer guided warp and FRNet extrapolate at low resolution; one U-Net with two encoders supersamples "
+            "rendered and extrapolated frames alike",
+            "FRNet's layers, all sigmas, how the output is composed: coarse-to-fine flow after IFRNet, tuned sigmas, a "
+            "blend of clamped history and samples plus a residual",
+            "nothing of the history at output resolution",
+        ),
     ),
     "extrass-e": Variant(
-        "guided warp + FRNet, extrapolates at low resolution", _extrass_e, lambda config: [_frnet_stage(config)]
+        "guided warp + FRNet, extrapolates at low resolution",
+        methods.extrass_e,
+        {"frnet": Recipe(frnet_objective)},
+        {"method.width": (8, 16, 24), **FRNET},
+        page=Page(
+            "ExtraSS 2023",
+            "its low-resolution part: guided warp, then FRNet's flow",
+            "as above",
+            "no: the guided warp goes by G-buffers alone",
+        ),
     ),
-    "extrass-w": Variant("G-buffer guided warp only, extrapolates at low resolution", lambda c: methods.extrass_w()),
-}
+    "extrass-w": Variant(
+        "G-buffer guided warp only, extrapolates at low resolution",
+        methods.extrass_w,
+        page=Page(
+            "ExtraSS 2023",
+            "its guided warp alone: 33 candidates, the 4 most similar are blended",
+            "sigmas",
+            "no: as above",
+        ),
+    ),
+}  # fmt: skip

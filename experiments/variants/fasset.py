@@ -1,104 +1,101 @@
 """FASSET, its ablations (Table 4), and what it is compared with (Table 2)."""
 
-import dataclasses
 from functools import partial
 
 from essjax import methods
-from essjax.interfaces import Method
-from essjax.train import fasset_objective, halving
+from essjax.train import extranet_objective, fasset_objective, halving, nsrr_objective
 from essjax.train.objectives.extranet import reference_shading
-from experiments.config import Config
-from experiments.variants.base import Stage, Variant, main_budget
-from experiments.variants.extranet import PRESETS as EXTRANET_PRESETS
-from experiments.variants.extranet import extranet_stage
-from experiments.variants.nsrr import nsrr_stage
+from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.extranet import DECAY
+from experiments.variants.nsrr import features
 
 EPOCHS, EPOCHS_PER_HALVING = 150, 30
 """Of the paper (section 3.4)."""
 PRESETS = {
-    "smoke": {"first_width": 16, "occlusion_weight": 5.0},
-    "quick": {
-        "batch": 2, "width": 12, "first_width": 32, "learning_rate": 2e-3, "occlusion_weight": 0.3, "seconds": 590.0,
-    },
-    "paper": {
-        "batch": 8, "first_width": 128, "learning_rate": 1e-3, "occlusion_weight": 5.0, "steps": EPOCHS * 900,
-    },
+    #                           smoke quick  paper
+    "method.width":            (8,    12,    24),
+    "method.hidden":           (16,   32,    128),  # RenderINR's neurons: at output size they are most of the work
+    "fasset.batch":            (2,    2,     8),
+    "fasset.learning_rate":    (3e-3, 2e-3,  1e-3),
+    "fasset.steps":            (6,    None,  EPOCHS * 900),
+    "fasset.seconds":          (None, 590.0, None),
+    "fasset.loss.hole_weight": (5.0,  0.3,   5.0),
 }  # fmt: skip
-"""``first_width`` are RenderINR's neurons: at output size they are most of the work."""
 
 
-def _variant(summary: str, **options: bool) -> Variant:
-    def method(config: Config) -> Method:
-        return methods.fasset(scale=config.scale, width=config.width, hidden=config.first_width, **options)
-
-    def stages(config: Config) -> list[Stage]:
-        objective = fasset_objective(method(config), hole_weight=config.occlusion_weight)
-        decay = partial(halving, times=EPOCHS // EPOCHS_PER_HALVING)
-        return [
-            Stage("fasset", method(config), objective, config.batch, config.learning_rate, main_budget(config), decay)
-        ]
-
-    return Variant(summary, method, stages, presets=PRESETS)
-
-
-TWO_STAGE_PRESETS = {
-    "smoke": {"clip": 6},
-    "quick": {
-        "clip": 9, "first_batch": 8, "first_seconds": 145.0, "occlusion_weight": 1.0,
-        "learning_rate": 1e-3, "vgg_weight": 0.1, "seconds": 145.0,
-    },
-    "paper": {
-        "clip": 9, "first_learning_rate": 1e-3, "first_steps": EPOCHS * 900,
-        "batch": 8, "width": 32, "learning_rate": 1e-4, "vgg_weight": 0.1, "steps": EPOCHS * 900,
-    },
-}  # fmt: skip
-"""First ExtraNet, then NSRR; the paper trains both for as many epochs as its own network."""
-
-
-def _extranet_nsrr(config: Config) -> Method:
-    return methods.extranet_nsrr(scale=config.scale, width=config.width)
-
-
-def _two_stages(config: Config) -> list[Stage]:
-    first = dataclasses.replace(
-        config,
-        batch=config.first_batch,
-        learning_rate=config.first_learning_rate,
-        steps=config.first_steps,
-        seconds=config.first_seconds,
-    )
-    return [
-        extranet_stage(first, methods.extranet()),
-        nsrr_stage(config, half=True, within=_extranet_nsrr(config)),
-    ]
-
-
-def _plus_stage(config: Config) -> list[Stage]:
-    stage = extranet_stage(config, methods.extranet_plus(scale=config.scale), target_shading=reference_shading)
-    return [dataclasses.replace(stage, name="extranet_plus")]
+def _variant(summary: str, *, page: Page | None = None, **options: bool) -> Variant:
+    recipe = Recipe(fasset_objective, decay=partial(halving, times=EPOCHS // EPOCHS_PER_HALVING))
+    factory = partial(methods.fasset, **options) if options else methods.fasset
+    return Variant(summary, factory, {"fasset": recipe}, PRESETS, page=page)
 
 
 VARIANTS = {
-    "fasset": _variant("FASSET: one network supersamples and extrapolates, at any output size"),
+    "extranet-plus": Variant(
+        "ExtraNet at output resolution on zero-upsampled frames",
+        methods.extranet_plus,
+        {"extranet_plus": Recipe(partial(extranet_objective, target_shading=reference_shading), decay=DECAY)},
+        {
+            #                                  smoke quick paper
+            "extranet_plus.batch":            (2,    2,    8),
+            "extranet_plus.clip":             (6,    6,    6),
+            "extranet_plus.steps":            (6,    None, EPOCHS * 900),
+            "extranet_plus.loss.hole_weight": (0.3,  1.0,  1.0),
+        },
+        page=Page(
+            "FASSET",
+            "ExtraNet fed zero-padded high-resolution frames",
+            "its 0.10 M parameters are not the released net's",
+            "a hole",
+        ),
+    ),
+    "fasset": _variant(
+        "FASSET: one network supersamples and extrapolates, at any output size",
+        page=Page(
+            "FASSET",
+            "one recurrent gated U-Net for both kinds, its features decoded at any output size by an implicit MLP",
+            "widths, the recurrent module, what it remembers (hidden state and last output) and how that is warped",
+            "a hole",
+        ),
+    ),
     "fasset-no-gencoder": _variant("FASSET whose RenderINR reads the G-buffers themselves", gencoder=False),
     "fasset-no-mask": _variant("FASSET without holes in rendered frames", mask_rendered=False),
     "fasset-no-sharing": _variant("FASSET with a FrameEncoder for each task", shared=False),
+    # First ExtraNet, then NSRR; the paper trains both for as many epochs as its own network.
     "extranet+nsrr": Variant(
         "ExtraNet at low resolution, then NSRR on every frame",
-        _extranet_nsrr,
-        _two_stages,
-        parts=("nsrr+extranet",),
-        presets=TWO_STAGE_PRESETS,
+        methods.extranet_nsrr,
+        {
+            "extranet": Recipe(extranet_objective, method=lambda settings: methods.extranet(), decay=DECAY),
+            "nsrr": Recipe(
+                partial(nsrr_objective, half=True),
+                unrolls=lambda s: methods.nsrr(scale=s.data.scale, width=s.method.width, half=True),
+                vgg=features,
+            ),
+        },
+        {
+            #                             smoke quick  paper
+            "method.width":              (8,    16,    32),
+            "stages.clip":               (6,    9,     9),
+            "stages.seconds":            (None, 145.0, None),
+            "extranet.batch":            (2,    8,     8),
+            "extranet.learning_rate":    (1e-3, 1e-3,  1e-3),
+            "extranet.steps":            (4,    None,  EPOCHS * 900),
+            "extranet.loss.hole_weight": (0.3,  1.0,   1.0),
+            "nsrr.learning_rate":        (3e-3, 1e-3,  1e-4),
+            "nsrr.steps":                (6,    None,  EPOCHS * 900),
+            "nsrr.loss.vgg_weight":      (0.01, 0.1,   0.1),
+        },
+        parts={"nsrr+extranet": {}},
+        page=Page(
+            "FASSET, Table 2", "extrapolates at low resolution, then supersamples every frame", reactive="a hole"
+        ),
     ),
     "nsrr+extranet": Variant(
         "NSRR on rendered frames, then ExtraNet at output resolution with upsampled G-buffers",
-        lambda config: methods.nsrr_extranet(scale=config.scale, width=config.width),
+        methods.nsrr_extranet,
         weights="extranet+nsrr",
+        page=Page(
+            "FASSET, Table 2", "supersamples rendered frames, then extrapolates at high resolution", reactive="a hole"
+        ),
     ),
-    "extranet-plus": Variant(
-        "ExtraNet at output resolution on zero-upsampled frames",
-        lambda config: methods.extranet_plus(scale=config.scale),
-        _plus_stage,
-        presets={**EXTRANET_PRESETS, "quick": {**EXTRANET_PRESETS["quick"], "batch": 2}},
-    ),
-}
+}  # fmt: skip

@@ -3,53 +3,65 @@
 from essjax import methods
 from essjax.interfaces import Method
 from essjax.train import ifrnet_objective
-from experiments.config import Config
-from experiments.variants.base import Stage, Variant, main_budget
+from experiments.variants.base import Page, Recipe, Variant
 
 
-def _ifrnet(config: Config) -> Method:
-    return methods.ifrnet(width=config.width)
-
-
-def _ifrnet_taa(config: Config) -> Method:
-    return methods.with_taa(_ifrnet(config))
-
-
-def _stages(config: Config) -> list[Stage]:
-    method = _ifrnet(config)
-    objective = ifrnet_objective(method, feature_weight=config.feature_weight)
-    return [Stage("ifrnet", method, objective, config.batch, config.learning_rate, main_budget(config))]
+def _ifrnet_taa(*, width: int = 24) -> Method:
+    return methods.with_taa(methods.ifrnet(width=width))
 
 
 VARIANTS = {
     "ifrnet": Variant(
         "IFRNet: interpolation by learned optical flow, without G-buffers, low resolution (+1 frame of latency)",
-        _ifrnet,
-        _stages,
-        parts=("ifrnet+taa",),
-        presets={
-            "smoke": {"clip": 3, "feature_weight": 0.01},
-            "quick": {
-                "clip": 3, "batch": 8, "feature_weight": 0.01, "learning_rate": 1e-3, "seconds": 290.0,
-            },
+        methods.ifrnet,
+        {"ifrnet": Recipe(ifrnet_objective)},
+        {
             # 300 epochs, batch 24, crops of 224, Adam 1e-4 as published, on ExtraSS's epochs.
-            "paper": {
-                "clip": 3, "crop": (224, 224), "batch": 24, "feature_weight": 0.01, "learning_rate": 1e-4,
-                "steps": 300 * 300,
-            },
+            #                        smoke     quick     paper
+            "method.width":         (8,        16,       24),
+            "ifrnet.batch":         (2,        8,        24),
+            "ifrnet.clip":          (3,        3,        3),
+            "ifrnet.crop":          ((32, 24), (48, 48), (224, 224)),
+            "ifrnet.learning_rate": (3e-3,     1e-3,     1e-4),
+            "ifrnet.steps":         (6,        None,     300 * 300),
         },
+        parts={"ifrnet+taa": {}},
+        page=Page(
+            "Kong et al. 2022",
+            "flows to both neighbours, coarse to fine, with an intermediate feature",
+            "jitter of its inputs",
+            "no: both neighbours are read everywhere",
+        ),
     ),
     "ifrnet+taa": Variant(
         "IFRNet at native resolution, then temporal anti-aliasing: half of the frames rendered, all pixels (+1 frame)",
         _ifrnet_taa,
         weights="ifrnet",
+        page=Page(
+            "ExtraSS 2023, Table 3",
+            "IFRNet at output resolution, TAA behind it",
+            "TAA's settings: its defaults, not tuned",
+            "no: as above",
+        ),
     ),
     "bsr": Variant(
         "bidirectional scene reprojection, interpolates at low resolution (+1 frame of latency)",
-        lambda c: methods.bsr(),
+        methods.bsr,
+        page=Page(
+            "Yang et al. 2011",
+            "fixed-point search for each pixel in both neighbours, then a blend",
+            "iterations",
+            "no: as above",
+        ),
     ),
     "3d-warp": Variant(
         "forward warp of both rendered frames, interpolates at low resolution (+1 frame of latency)",
-        lambda c: methods.warp_3d(),
+        methods.warp_3d,
+        page=Page(
+            "Mark et al. 1997",
+            "both neighbours splatted to the middle by motion and depth",
+            "hole filling",
+            "no: as above",
+        ),
     ),
 }  # fmt: skip

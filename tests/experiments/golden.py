@@ -3,7 +3,6 @@
 ``python -m tests.experiments.golden`` writes ``golden.json`` again, after a change of settings that is meant.
 """
 
-import dataclasses
 import functools
 import inspect
 import json
@@ -13,15 +12,17 @@ from pathlib import Path
 from essjax import methods, train
 from essjax.interfaces import Method, Network
 from essjax.train import Recurrent
-from experiments.config import PRESETS
-from experiments.variants import VARIANTS, compared, config_of, stages_of
+from experiments.members import _member, settings_of
+from experiments.settings import PRESETS
+from experiments.training import check_crop
+from experiments.variants import VARIANTS, compared
 
 FILE = Path(__file__).with_name("golden.json")
 AT = (0.0, 0.2, 0.5, 0.8, 1.0)
 """Progress at which decays are sampled."""
 DATA = (
     "seed", "size", "scale", "train_sequences", "validation_sequences", "test_sequences", "train_frames", "test_frames",
-    "train_spp", "test_spp", "mip_bias", "jitter", "fresh", "save_every", "average", "validations", "tune", "warmup",
+    "train_spp", "test_spp", "mip_bias", "jitter", "fresh", "optimizer", "save_every", "average", "validations", "tune", "warmup",
     "pictures", "optimize",
 )  # fmt: skip
 
@@ -67,26 +68,24 @@ def plain(value):
 
 def resolved(name, preset):
     """What a run of variant ``name`` does with ``preset``."""
-    config = config_of(name, preset, [])
-    with Calls() as made:
-        VARIANTS[name].method(config)
-    with Calls() as trained:
-        stages = stages_of(name, config)
-    settings = dataclasses.asdict(config)
+    settings = settings_of(name, preset)
+    with Calls() as calls:
+        member = _member(name, settings, Path())
+    shared = {**vars(settings), **vars(settings.data), **vars(settings.training), **vars(settings.evaluation)}
     return {
-        "data": {key: settings[key] for key in DATA},
+        "data": {key: shared[key] for key in DATA},
         "rows": compared([name]),
-        "method": list(dict.fromkeys(made)),
-        "calls": list(dict.fromkeys(trained)),
+        "calls": sorted(set(calls)),
         "stages": {
             stage.name: {
                 "method": stage.method.info.name, "recurrent": isinstance(stage.objective, Recurrent),
-                "batch": stage.batch, "crop": config.crop, "clip": config.clip, "rate": stage.learning_rate,
+                "batch": stage.settings.batch, "clip": stage.settings.clip, "rate": stage.settings.learning_rate,
+                "crop": check_crop(stage.settings, *settings.data.size, settings.data.scale),
                 "decay": [round(stage.decay(progress), 12) for progress in AT],
                 "steps": stage.budget.steps, "seconds": stage.budget.seconds,
                 "ranges": stage.ranges, "vgg": stage.vgg,
             }
-            for stage in stages
+            for stage in member.stages
         },
     }  # fmt: skip
 

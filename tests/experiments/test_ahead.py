@@ -13,7 +13,7 @@ def compile_stages(monkeypatch):
     """Starts ``Ahead`` on stages whose compilation waits for an event; "broken" fails. Returns it, event and log."""
     go, log = threading.Event(), []
 
-    def fake(stages, stage, config):
+    def fake(member, stage):
         go.wait(10)
         log.append(stage.name)
         if stage.name == "broken":
@@ -21,7 +21,8 @@ def compile_stages(monkeypatch):
         return f"step of {stage.name}"
 
     monkeypatch.setattr(ahead, "_compile", fake)
-    return lambda *names: (ahead.Ahead([types.SimpleNamespace(name=name) for name in names], None), go, log)  # type: ignore
+    stages = lambda names: tuple(types.SimpleNamespace(name=name) for name in names)  # noqa: E731
+    return lambda *names: (ahead.Ahead(types.SimpleNamespace(stages=stages(names))), go, log)  # type: ignore
 
 
 def test_a_stage_waits_for_all_of_them(compile_stages):

@@ -1,6 +1,7 @@
 """Everything that can be refused is refused before a frame is rendered, and leaves nothing behind."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,9 +10,13 @@ import pytest
 from essjax.data import write_dataset, write_sequence
 from experiments import run
 from experiments.checks import check_settings
-from experiments.config import PRESETS, make_config
-from experiments.variants import config_of
+from experiments.members import all_settings, resolve
+from experiments.settings import PRESETS
 from tests.helpers import make_sequence
+
+
+def member(name, preset, overrides):
+    return resolve(all_settings([name], preset, overrides), preset, Path("out"))[name]
 
 
 def printed(capsys):
@@ -20,27 +25,27 @@ def printed(capsys):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_has_frames_to_score(preset):
-    check_settings(["extrass"], {"extrass": config_of("extrass", preset, ["test_sequences=4"])})
+    check_settings([member("extrass", preset, ["data.test_sequences=4"])])
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["warmup=5"], "the built-in scenes, split test: expected frames to score in .*, got none in test-cuts-"),
-        (["tune=true", "warmup=8"], "validation: .* got none in validation-corrid"),
-        (["crop=[32,20]"], r"crop: expected at least 24x24 LR .* got 32x20 from crop \(32, 20\) of 48x28 frames"),
-        (["size=[40,20]"], "got 32x20 from crop"),
+        (["evaluation.warmup=5"], "scenes, split test: expected frames to score in .*, got none in test-cuts-"),
+        (["evaluation.tune=true", "evaluation.warmup=8"], "validation: .* got none in validation-corrid"),
+        (["stages.crop=[32,20]"], r"expected at least 24x24 LR .* got 32x20 from crop \(32, 20\) of 48x28 frames"),
+        (["data.size=[40,20]"], "got 32x20 from crop"),
     ],
 )  # fmt: skip
 def test_settings_are_refused_before_anything_is_rendered(overrides, message, tmp_path, capsys):
     with pytest.raises(ValueError, match=message):
-        check_settings(["extrass"], {"extrass": make_config("smoke", overrides)})
+        check_settings([member("extrass", "smoke", overrides)])
     assert run.main(["--preset", "smoke", "--out", str(tmp_path / "out"), "--set", *overrides]) == 2
     assert not (tmp_path / "out").exists()
 
 
 def test_the_crop_is_of_no_matter_where_nothing_is_trained():
-    check_settings(["taau"], {"taau": make_config("smoke", ["crop=[8,8]"])})
+    check_settings([member("taau", "smoke", ["stages.crop=[8,8]"])])
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +64,13 @@ def imported(tmp_path_factory):
     ("arguments", "message"),
     [
         (["--variant", "extrass"], "extrass cannot run on it: this dataset has no base_color, normal."),
-        (["--variant", "nsrr", "--set", "scale=4"], "nsrr cannot run on it: it enlarges 4 times, this dataset's"),
-        (["--variant", "nsrr", "--set", "fresh=3"], "was not made by the built-in renderer"),
-        (["--variant", "nsrr", "--set", "crop=[24,16]"], "got 24x16 from crop (24, 16) of 32x24 frames"),
-        (["--variant", "nsrr", "--set", "warmup=5"], "expected frames to score in every sequence, got none in a"),
+        (["--variant", "nsrr", "--set", "data.scale=4"], "nsrr cannot run on it: it enlarges 4 times, this dataset's"),
+        (["--variant", "nsrr", "--set", "data.fresh=3"], "was not made by the built-in renderer"),
+        (["--variant", "nsrr", "--set", "nsrr.crop=[24,16]"], "got 24x16 from crop (24, 16) of 32x24 frames"),
+        (
+            ["--variant", "nsrr", "--set", "evaluation.warmup=5"],
+            "expected frames to score in every sequence, got none in a",
+        ),
     ],
 )
 def test_data_is_refused_before_the_folder_is_taken(imported, arguments, message, tmp_path, capsys):

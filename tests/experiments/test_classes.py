@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from essjax.data import write_dataset, write_sequence
+from essjax.data import read_dataset, write_dataset, write_sequence
 from essjax.exposure import exposed
 from essjax.frames import Prediction
 from essjax.interfaces import Method, MethodInfo
 from essjax.labels import ALIASING, GHOSTING, Thresholds, label_sequence
 from experiments import datasets
 from experiments.classes import QUESTIONS, class_remark, class_scores, confusion, evaluate_classes
-from experiments.config import PRESETS
 from experiments.evaluate import Clip
+from experiments.members import settings_of
 from experiments.report.classes import COLORS, class_picture, write_class_sheet
 from tests.helpers import make_sequence
 
@@ -95,7 +95,7 @@ def test_only_clips_that_something_reads_have_native_frames(tmp_path, monkeypatc
     asked = []
     monkeypatch.setattr(datasets, "generate", lambda out, clips, *size, **settings: asked.extend(clips))
     with pytest.raises(AttributeError):  # there is no dataset
-        datasets.prepare(PRESETS["quick"], None, tmp_path, lambda n, total: None)
+        datasets.prepare(settings_of("warp", "quick"), None, tmp_path, lambda n, total: None)
     assert {(clip.split, clip.native) for clip in asked} == {("train", False), ("validation", True), ("test", True)}
 
 
@@ -104,7 +104,7 @@ def test_data_without_ranges_or_native_frames_is_refused_before_training(tmp_pat
     write_sequence(tmp_path, "a", sequence)
     write_dataset(tmp_path, {split: ["a"] for split in ("train", "validation", "test")})
     prepare = lambda **needs: datasets.prepare(  # noqa: E731
-        PRESETS["smoke"], str(tmp_path), tmp_path, lambda n, total: None, **needs
+        settings_of("warp", "smoke"), read_dataset(tmp_path), tmp_path, lambda n, total: None, **needs
     )
     assert not prepare().info.ranges
     for need in ("ranges", "native"):

@@ -2,6 +2,7 @@
 
 import functools
 import os
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,23 +15,23 @@ from essjax.rollout import alternate, every, unroll
 from essjax.train import adam, create_state, make_train_step
 from experiments import datasets
 from experiments.ahead import batch_shapes, state_shapes
-from experiments.config import PRESETS
+from experiments.members import resolve, settings_of
 from experiments.training import initial_variables, make_batches
-from experiments.variants import VARIANTS, config_of, stages_of
+from experiments.variants import VARIANTS
 from tests.helpers import streamed
 
 pytestmark = pytest.mark.skipif(
     not os.environ.get("ESSJAX_SWEEP"), reason="compiles every variant, four minutes: ESSJAX_SWEEP=1, --dist load"
 )
 STEPS = 8
-SIZES = ["size=[40,28]", "crop=[32,24]", "test_frames=7", "train_frames=7"]
+SIZES = ["data.size=[40,28]", "stages.crop=[32,24]", "data.test_frames=7", "data.train_frames=7"]
 STREAMED = [
     name
     for name, variant in VARIANTS.items()
     # Ablations share their method's file; extrass and the TAA family are streamed in their own tests.
     if "-no-" not in name and "-theta-" not in name and not name.startswith(("extrass", "ta", "jau-", "dlctus-"))
 ]
-TRAINED = [name for name, variant in VARIANTS.items() if variant.stages(PRESETS["smoke"])]
+TRAINED = [name for name, variant in VARIANTS.items() if variant.stages]
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +39,8 @@ def dataset(tmp_path_factory):
     """One family, rendered once for all variants."""
     patch = pytest.MonkeyPatch()
     patch.setattr(datasets, "plan", functools.partial(plan, families=["carousel"]))
-    config = config_of("extrass", "smoke", SIZES)
-    yield datasets.prepare(config, None, tmp_path_factory.mktemp("every"), lambda n, total: None, ranges=True)
+    settings = settings_of("extrass", "smoke", SIZES)
+    yield datasets.prepare(settings, None, tmp_path_factory.mktemp("every"), lambda n, total: None, ranges=True)
     patch.undo()
 
 
@@ -50,20 +51,21 @@ def assert_same_shapes(expected, actual):
 
 def train(name, dataset):
     """Train every stage of a variant on one batch; stage -> losses, and the variables."""
-    config = config_of(name, "smoke", SIZES)
-    stages, losses = stages_of(name, config), {}
-    variables = initial_variables(stages, dataset, config)
+    settings = settings_of(name, "smoke", SIZES)
+    member = resolve({name: settings}, "smoke", Path())[name]
+    stages, losses = member.stages, {}
+    variables = initial_variables(member, dataset)
     for stage in stages:
         transform = adam()
         step = make_train_step(stage.objective, transform, stage.name)
         names = [s.name for s in stages[: stages.index(stage) + 1]]
         state = create_state({entry: variables[entry] for entry in names}, stage.name, transform)
-        batch, losses[stage.name] = next(make_batches(dataset, config, stage)), []
-        expected = batch_shapes(config, stage)  # what the run command compiles for, before there are data
+        batch, losses[stage.name] = next(make_batches(dataset, settings, stage)), []
+        expected = batch_shapes(settings, stage)  # what the run command compiles for, before there are data
         assert_same_shapes(expected, batch)
-        assert_same_shapes(state_shapes(stages, stage, config, expected), state)
+        assert_same_shapes(state_shapes(member, stage, expected), state)
         for _ in range(STEPS):
-            state, terms = step(state, batch, stage.learning_rate)
+            state, terms = step(state, batch, stage.settings.learning_rate)
             losses[stage.name].append(float(terms["loss"]))
         variables = {**variables, **state.variables}
     return losses, variables
@@ -81,8 +83,7 @@ def test_the_loss_falls(name, dataset):
 @pytest.mark.parametrize("name", STREAMED)
 def test_streaming_is_unrolling(name, dataset):
     """Frame by frame with donated history, a cut in between, against one scan."""
-    config = config_of(name, "smoke", SIZES)
-    method = VARIANTS[name].method(config)
+    method = VARIANTS[name].method(settings_of(name, "smoke", SIZES))
     from essjax.data import disk_source
 
     sequence = disk_source(dataset, "test", native=method.info.native)[0]

@@ -10,8 +10,8 @@ from essjax.data.layout import Dataset, Segment, SequenceInfo
 from experiments import compare, run
 from experiments.checks import check_scored
 from experiments.comparison import _read_settings
-from experiments.config import make_config
-from experiments.experiment import check_folder, default_folder
+from experiments.members import settings_of
+from experiments.request import check_folder, default_folder
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -55,7 +55,7 @@ def test_data_that_is_not_there_does_not_lock_the_folder(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--set", "size=[0,4]"], "--set size=[0,4]: expected [width,height], got '[0,4]'"),
+        (["--set", "data.size=[x]"], "--set data.size: expected [width,height], got '[x]'"),
         (["--data", "/nowhere/[take1]"], "/nowhere/[take1]/dataset.json: not found"),
         (["--data", "/nowhere/[/x]"], "/nowhere/[/x]/dataset.json: not found"),
     ],
@@ -102,19 +102,29 @@ def dataset(cuts, score_from=0):
 @pytest.mark.parametrize(
     ("cuts", "score_from", "overrides", "message"),
     [
-        ({"a": [0], "b": [0, 4]}, 0, ["warmup=4"], "split test: expected frames .*, got none in b: all are"),
-        ({"a": [0], "b": []}, 0, ["warmup=20"], r"none in a, b: all are among the 20 that .* --set warmup=N\."),
-        ({"a": [0]}, 7, ["tune=true", "warmup=8"], "split validation: expected frames to score"),
-        ({"a": [0]}, 7, ["validations=1", "warmup=8"], "split validation: expected frames to score"),
-        ({"a": [], "b": [0, 4]}, 0, ["warmup=3"], ""),
-        ({"a": [0, 3]}, 7, ["warmup=4"], ""),  # the last frame alone
-        ({"a": [0, 3]}, 7, ["warmup=5"], "split test"),
+        ({"a": [0], "b": [0, 4]}, 0, ["evaluation.warmup=4"], "split test: expected frames .*, got none in b: all are"),
+        (
+            {"a": [0], "b": []},
+            0,
+            ["evaluation.warmup=20"],
+            r"none in a, b: all are among the 20 that .* --set evaluation.warmup=N\.",
+        ),
+        ({"a": [0]}, 7, ["evaluation.tune=true", "evaluation.warmup=8"], "split validation: expected frames to score"),
+        (
+            {"a": [0]},
+            7,
+            ["training.validations=1", "evaluation.warmup=8"],
+            "split validation: expected frames to score",
+        ),
+        ({"a": [], "b": [0, 4]}, 0, ["evaluation.warmup=3"], ""),
+        ({"a": [0, 3]}, 7, ["evaluation.warmup=4"], ""),  # the last frame alone
+        ({"a": [0, 3]}, 7, ["evaluation.warmup=5"], "split test"),
     ],
 )
 def test_data_of_which_nothing_would_be_scored(cuts, score_from, overrides, message):
-    config = make_config("smoke", ["validations=null", *overrides])
+    settings = settings_of("warp", "smoke", ["training.validations=null", *overrides])
     if not message:
-        check_scored(dataset(cuts, score_from), config)
+        check_scored(dataset(cuts, score_from), settings)
         return
     with pytest.raises(ValueError, match=message):
-        check_scored(dataset(cuts, score_from), config)
+        check_scored(dataset(cuts, score_from), settings)

@@ -19,8 +19,14 @@ def test_every_variant_and_preset_is_resolved_as_recorded():
 
 def test_the_record_has_arguments_and_defaults():
     """Of ExtraSS by hand: a width that the preset gives, sigmas that nobody gives; nothing from within the factory."""
-    (call,) = golden.resolved("extrass", "paper")["method"]
-    assert call.startswith("extrass(frnet_width=24, scale=2, sigma_distance=") and call.endswith("width=24)")
+    calls = golden.resolved("extrass", "paper")["calls"]
+    assert [call.partition("(")[0] for call in calls] == [
+        "extrass",
+        "extrass_e",
+        "extrass_objective",
+        "frnet_objective",
+    ]
+    assert calls[0].startswith("extrass(frnet_width=24, scale=2, sigma_distance=") and calls[0].endswith("width=24)")
     calls = golden.resolved("classifier", "smoke")["calls"]
     assert any(call.startswith("composition_objective(method=classifier, temporal_weight=0.1") for call in calls)
     assert not any("Network" in call or " at 0x" in call for call in calls)

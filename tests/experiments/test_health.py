@@ -45,7 +45,7 @@ def test_a_training_that_did_harm():
 def test_few_steps():
     warnings = health.few_steps({"frnet": report(1), "extrassnet": report(health.FEW_STEPS)})
     assert len(warnings) == 1 and warnings[0].startswith("frnet made only 1 step: too few to learn much")
-    assert "--set seconds=N first_seconds=N" in warnings[0]
+    assert "--set frnet.seconds=N (or .steps=N)" in warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from experiments import compare, comparison, datasets, run, variants
+from experiments.members import settings_of
 
 
 class Finished(tuple):
@@ -29,7 +30,13 @@ def finished(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr(variants, "BASELINES", ("extrass-w", "bilinear"))
     patch.setattr(datasets, "plan", functools.partial(datasets.plan, families=["carousel"]))
-    overrides = ["test_frames=7", "train_frames=5", "first_steps=2", "steps=2", "size=[32,24]", "crop=[32,24]"]
+    overrides = [
+        "data.test_frames=7",
+        "data.train_frames=5",
+        "stages.steps=2",
+        "data.size=[32,24]",
+        "stages.crop=[32,24]",
+    ]
     with contextlib.redirect_stdout(io.StringIO()) as output:
         code = run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides])
     yield Finished((out, code, overrides), output.getvalue())
@@ -43,7 +50,9 @@ def test_metrics_json(finished):
     assert metrics["schema"] == 1 and metrics["variant"] == "extrass" and metrics["preset"] == "smoke"
     assert metrics["environment"]["steps"] == {"frnet": 2, "extrassnet": 2}
     assert metrics["overrides"] == overrides
-    assert metrics["configs"]["extrass"]["size"] == [32, 24] and metrics["configs"]["extrass"]["width"] == 8
+    settings = metrics["configs"]["extrass"]
+    assert settings["data"]["size"] == [32, 24] and settings["method"]["width"] == 8
+    assert settings["stages"]["frnet"]["loss"] == {"feature_weight": 0.001}
     assert {"commit", "device", "versions", "seed"} <= set(metrics["environment"])
     phases = {"data", "compilation", "training", "validation", "tuning", "evaluation", "report", "total"}
     assert set(metrics["seconds"]) == phases and metrics["seconds"]["compilation"] >= 0
@@ -94,8 +103,8 @@ def test_a_finished_folder_is_not_overwritten(finished, capsys):
     out, _, overrides = finished
     assert run.main(["--preset", "smoke", "--out", str(out), "--set", *overrides]) == 2
     assert "already holds a run. Continue it with --resume" in capsys.readouterr().out.replace("\n", " ")
-    assert run.main(["--preset", "smoke", "--out", str(out), "--resume", "--set", *overrides, "width=6"]) == 2
-    assert "width was 8, now 6" in capsys.readouterr().out.replace("\n", " ")
+    assert run.main(["--preset", "smoke", "--out", str(out), "--resume", "--set", *overrides, "method.width=6"]) == 2
+    assert "method.width was 8, now 6" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_eval_only_gives_the_same_numbers(finished):
@@ -113,7 +122,7 @@ def test_eval_only_gives_the_same_numbers(finished):
     [
         (["--variant", "extras"], "unknown variant 'extras'; choose one of extrass"),
         (["--preset", "fast"], "unknown preset 'fast'; choose one of smoke"),
-        (["--set", "widht=3"], "unknown key 'widht'; valid keys are seed"),
+        (["--set", "widht=3"], "unknown setting 'widht'; the top level has seed"),
         (["--eval-only"], "holds no run"),
         (["--data", "nowhere"], "nowhere/dataset.json: not found"),
     ],
@@ -125,7 +134,7 @@ def test_bad_arguments_are_one_line(arguments, message, tmp_path, capsys):
 
 def test_a_crop_that_is_too_small(finished, tmp_path, capsys):
     out, _, _ = finished
-    settings = ["crop=[32,16]", "first_steps=1", "steps=1"]
+    settings = ["stages.crop=[32,16]", "stages.steps=1"]
     arguments = ["--preset", "smoke", "--data", str(out / "scenes"), "--out", str(tmp_path / "out"), "--set", *settings]
     assert run.main(arguments) == 2
     assert "crop: expected at least 24x24 LR pixels" in capsys.readouterr().out.replace("\n", " ")
@@ -154,15 +163,15 @@ def test_list_names_all_variants(capsys):
     ],
 )
 def test_rows_that_are_not_on_equal_terms(name, reason):
-    config = variants.config_of(name, "smoke", [])
-    assert comparison.unequal(variants.VARIANTS[name].method(config).info, 2) == reason
+    method = variants.VARIANTS[name].method(settings_of(name, "smoke"))
+    assert comparison.unequal(method.info, 2) == reason
 
 
 def test_compare_shares_one_training_between_variants_that_differ_in_their_steps(finished, tmp_path, monkeypatch):
     """A twin of ``extrass-e`` with its weights: one training, two rows with the same numbers; the extra row is kept."""
     scenes, _, overrides = finished
     twin = dataclasses.replace(variants.VARIANTS["extrass-e"], weights="extrass-e")
-    monkeypatch.setitem(variants.VARIANTS, "twin", dataclasses.replace(twin, stages=lambda config: []))
+    monkeypatch.setitem(variants.VARIANTS, "twin", dataclasses.replace(twin, stages={}, presets={}))
     monkeypatch.setattr(variants, "BASELINES", ("extrass-w",))
     out = tmp_path / "out"
     arguments = [

@@ -101,22 +101,22 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys):
 
 def test_the_command_fills_a_table(tmp_path, monkeypatch, capsys):
     """The comparison itself is tested elsewhere: here it returns known rows."""
-    from experiments import compare
+    from experiments import experiment
     from experiments.tables.__main__ import main
 
     asked = {}
 
-    def fake(names, **arguments):
-        asked.update(names=names, **arguments)
+    def fake(request, console):
+        asked.update(request._asdict())
         return {"dataset": "d", "environment": {}, "seconds": {}, **METRICS}
 
-    monkeypatch.setattr(compare, "compare", fake)
-    monkeypatch.setitem(tables.TABLES, "toy-1", TOY._replace(settings=("scale=4",)))
-    assert main(["toy-1", "--preset", "smoke", "--out", str(tmp_path), "--set", "steps=3"]) == 0
-    assert asked["names"] == ["extrass", "taau"] and asked["overrides"] == ["scale=4", "steps=3"]
+    monkeypatch.setattr(experiment, "run_experiment", fake)
+    monkeypatch.setitem(tables.TABLES, "toy-1", TOY._replace(settings=("data.scale=4",)))
+    assert main(["toy-1", "--preset", "smoke", "--out", str(tmp_path), "--set", "stages.steps=3"]) == 0
+    assert asked["names"] == ("extrass", "taau") and asked["overrides"] == ("data.scale=4", "stages.steps=3")
     content = json.loads((tmp_path / "tables.json").read_text())
     assert content["tables"]["toy-1"]["ours"]["PSNR"] == 25.0 and content["runs"][0]["tables"] == ["toy-1"]
     monkeypatch.setitem(tables.TABLES, "toy-1", TOY._replace(half_input=True))
     assert main(["toy-1", "--preset", "paper", "--out", str(tmp_path)]) == 0
-    assert asked["overrides"] == ["size=[480,270]", "crop=[64,64]"]
+    assert asked["overrides"] == ("data.size=[480,270]", "stages.crop=[64,64]")
     assert "**25.00**" in (tmp_path / "tables.md").read_text() and "toy-1" in capsys.readouterr().out

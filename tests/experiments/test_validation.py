@@ -8,8 +8,8 @@ import pytest
 
 from essjax import methods
 from essjax.data import Segment, write_dataset, write_sequence
-from experiments.config import make_config
 from experiments.evaluate import Clips, Runner, evaluate
+from experiments.members import settings_of
 from experiments.validation import CLIPS, SCORED, Scorer, windows
 from tests.helpers import make_sequence
 
@@ -31,29 +31,29 @@ def dataset(tmp_path_factory):
 
 
 def test_windows(dataset):
-    found = windows(dataset, make_config("smoke", ["warmup=5"]), native=False)
+    found = windows(dataset, settings_of("warp", "smoke", ["evaluation.warmup=5"]), native=False)
     assert [len(window.sequence.frames.cut) for window in found] == [9, 8, 9]
     assert [window.scored for window in found] == [[5, 6, 7, 8], [5, 6, 7], [5, 6, 7, 8]]
     jitter = lambda name, n: dataset.sequences[name].frames[n]["jitter"]
     starts = [window.sequence.frames.jitter[0].tolist() for window in found]
     assert starts == [pytest.approx(jitter(*at)) for at in (("a", 0), ("b", 4), ("c", 2))]
-    assert windows(dataset, make_config("smoke", ["warmup=20"]), native=False) == []
+    assert windows(dataset, settings_of("warp", "smoke", ["evaluation.warmup=20"]), native=False) == []
 
 
 def test_of_many_clips_a_few_are_played(dataset):
     many = dataclasses.replace(dataset, splits={**dataset.splits, "validation": 5 * dataset.splits["validation"]})
-    assert len(windows(many, make_config("smoke", ["warmup=2"]), native=False)) == CLIPS < 15
+    assert len(windows(many, settings_of("warp", "smoke", ["evaluation.warmup=2"]), native=False)) == CLIPS < 15
 
 
 @pytest.mark.parametrize("method", [methods.bilinear(), methods.warp(), methods.taau()], ids=lambda m: m.info.name)
 def test_scores_are_those_of_the_evaluation(dataset, method):
     """Of the first clip, whose window is what evaluation plays from the start: the same frames give the same PSNR."""
-    config = make_config("smoke", ["warmup=5"])
+    settings = settings_of("warp", "smoke", ["evaluation.warmup=5"])
     alone = dataclasses.replace(dataset, splits={**dataset.splits, "validation": dataset.splits["validation"][:1]})
-    example = jax.tree.map(lambda leaf: leaf[:1], windows(alone, config, native=False)[0].sequence.frames)
+    example = jax.tree.map(lambda leaf: leaf[:1], windows(alone, settings, native=False)[0].sequence.frames)
     variables = method.init(jax.random.key(0), example)
-    scores = Scorer(method, alone, config)(variables)
-    runner = Runner(method, variables, config.compiler_options)
+    scores = Scorer(method, alone, settings)(variables)
+    runner = Runner(method, variables, settings.compiler_options)
     curves = evaluate({"it": runner}, Clips(alone, "validation", 5), pictures=0)["curves"]["it"]["a"]
     assert set(scores) == ({"ss"} if method.info.renders_all else set(method.info.predicts))
     for kind, value in scores.items():

@@ -1,6 +1,7 @@
 """Frames of colour, depth and motion alone: what runs on them, and what says clearly that it cannot."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,8 +11,8 @@ from essjax import methods, warp
 from essjax.frames import OPTIONAL_GBUFFERS, select_time
 from essjax.rollout import alternate, every, unroll
 from experiments import comparison
-from experiments.config import make_config
 from experiments.evaluate import Clip
+from experiments.members import all_settings, resolve
 from tests.helpers import make_frames, make_sequence
 
 
@@ -76,10 +77,10 @@ def test_a_comparison_leaves_out_what_lacks_a_buffer_and_says_so():
     assert comparison.unfit(methods.extrass_w(), sequence) == ""
     assert comparison.unfit(methods.extrass_w(), poor) == "this dataset has no base_color, normal"
     assert comparison.unfit(methods.taau(scale=2), poor) == ""
-    config, holes = make_config("smoke", []), np.zeros((3, 12, 18, 1))
-    asked = ["bilinear", "extranet+taa"]
+    asked, holes = ["bilinear", "extranet+taa"], np.zeros((3, 12, 18, 1))
+    members = resolve(all_settings(asked, "smoke", []), "smoke", Path())
     remarks = {
-        name: comparison.notes(asked, None, [Clip("a", s, (0, 1, 2), [1, 2], holes, False)], {}, config)  # type: ignore[arg-type]
+        name: comparison.notes(members, asked, [Clip("a", s, (0, 1, 2), [1, 2], holes, False)], {})
         for name, s in (("rich", sequence), ("poor", poor))
     }
     for row in ("taa", "extranet+taa"):

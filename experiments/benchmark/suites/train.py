@@ -17,10 +17,9 @@ from essjax.train import create_state, make_train_step, muon
 from experiments.benchmark import inputs
 from experiments.benchmark.measure import Case, measure, summary
 from experiments.benchmark.suites import Options, Row
-from experiments.config import Config, make_config
+from experiments.members import Member, resolve, settings_of
 from experiments.training import first_batch, initial_state, initial_variables, make_batches, make_step
-from experiments.variants import stages_of
-from experiments.variants.base import Stage
+from experiments.variants import Stage
 
 FRAMES = (5, 9, 13)
 """Lengths of clips; odd, as SS/ESS pairs need."""
@@ -41,16 +40,24 @@ def _clip(length: int, width: int, height: int, batch: int = BATCH) -> Sequence:
     return Sequence(frames=stacked, reference=reference)
 
 
+def _extrass(*overrides: str) -> Member:
+    """ExtraSS with the settings of the default run, and others."""
+    return resolve({"extrass": settings_of("extrass", "quick", overrides)}, "quick", Path())["extrass"]
+
+
+def _wide() -> Stage:
+    return _extrass(f"method.width={WIDTH}", f"method.frnet_width={WIDTH}").stages[-1]
+
+
 def _step_case(length: int, side: int) -> Case:
     """The whole train step: both rollouts, all losses, gradient, Adam."""
-    config = make_config("quick", [f"width={WIDTH}", f"first_width={WIDTH}"])
-    stage = stages_of("extrass", config)[-1]
-    return _case(f"train step, {length} frames of {side}x{side}, batch {BATCH}", stage, _clip(length, side, side))
+    return _case(f"train step, {length} frames of {side}x{side}, batch {BATCH}", _wide(), _clip(length, side, side))
 
 
-def _default_case(stage: Stage, config: Config) -> Case:
+def _default_case(stage: Stage) -> Case:
     """The same of a stage of the default run, at its shapes."""
-    return _case(f"{DEFAULT} {stage.name}", stage, _clip(config.clip, *config.crop, stage.batch))
+    settings = stage.settings
+    return _case(f"{DEFAULT} {stage.name}", stage, _clip(settings.clip, *settings.crop, settings.batch))
 
 
 def _case(name: str, stage: Stage, clip: Sequence) -> Case:
@@ -82,29 +89,30 @@ def _unrolled_case(method: Method, *, remat: bool, gradient: bool) -> Case:
 
 def rows(options: Options) -> Iterator[Row]:
     """Steps of the default run, of three lengths and three sizes, unrolled gradients, training that reads its clips."""
-    repetitions, default = options.repetitions, make_config("quick", [])
-    for stage in stages_of("extrass", default):
-        yield measure(_default_case(stage, default), repetitions)
+    repetitions = options.repetitions
+    for stage in _extrass().stages:
+        yield measure(_default_case(stage), repetitions)
     for length, side in sorted({(length, CROPS[1]) for length in FRAMES} | {(FRAMES[1], side) for side in CROPS}):
         yield measure(_step_case(length, side), repetitions)
-    method = stages_of("extrass", make_config("quick", [f"width={WIDTH}", f"first_width={WIDTH}"]))[-1].method
+    method = _wide().method
     for remat, gradient in ((False, False), (False, True), (True, True)):
         yield measure(_unrolled_case(method, remat=remat, gradient=gradient), repetitions)
     yield _loaded()
-    yield _loaded("fresh=20", "train_spp=1", "train_sequences=1")
+    yield _loaded("data.fresh=20", "data.train_spp=1", "data.train_sequences=1")
 
 
-def _loaded(*settings: str) -> Row:
+def _loaded(*overrides: str) -> Row:
     """A training loop on clips from disk, or fresh ones: what share of the time the step waits for its batch."""
-    config: Config = make_config("quick", list(settings))
-    stage = stages_of("extrass", config)[-1]
+    member = _extrass(*overrides)
+    settings, stage = member.settings, member.stages[-1]
+    data, training = settings.data, stage.settings
     with tempfile.TemporaryDirectory() as folder:
-        clips = plan("train", 1, config.train_frames, spp=1, families=["carousel"])
-        dataset = generate(Path(folder), clips, *config.size, scale=config.scale)
-        step = make_step(stage, config)
-        variables = initial_variables([stage], dataset, config)
-        state = initial_state([stage], stage, config, variables, first_batch(dataset, config, stage))
-        batches, waited, seconds = make_batches(dataset, config, stage), [], []
+        clips = plan("train", 1, data.train_frames, spp=1, families=["carousel"])
+        dataset = generate(Path(folder), clips, *data.size, scale=data.scale)
+        step = make_step(stage, settings)
+        variables = initial_variables(member, dataset)
+        state = initial_state(member, stage, variables, first_batch(dataset, settings, stage))
+        batches, waited, seconds = make_batches(dataset, settings, stage), [], []
         for n in range(LOADED_STEPS + 2):
             start = time.perf_counter()
             batch = next(batches)
@@ -114,10 +122,12 @@ def _loaded(*settings: str) -> Row:
             if n >= 2:
                 waited.append(ready - start)
                 seconds.append(time.perf_counter() - start)
-    origin = "read from disk" if config.fresh is None else f"new scenes every {config.fresh} steps, rendered meanwhile"
-    name = f"training, {config.clip} frames of {config.crop[0]}x{config.crop[1]}, batch {config.batch}, {origin}"
+    origin = "read from disk" if data.fresh is None else f"new scenes every {data.fresh} steps, rendered meanwhile"
+    name = (
+        f"training, {training.clip} frames of {training.crop[0]}x{training.crop[1]}, batch {training.batch}, {origin}"
+    )
     row = {"name": name, "implementation": "essjax", **summary(np.array(seconds))}
-    return {**row, "waiting_fraction": sum(waited) / sum(seconds), "work": {"frames": config.clip * config.batch}}
+    return {**row, "waiting_fraction": sum(waited) / sum(seconds), "work": {"frames": training.clip * training.batch}}
 
 
 def _fit(sizes: list[float], milliseconds: list[float]) -> tuple[float, float]:
