@@ -40,7 +40,7 @@ class Stage:
 
 
 @dataclasses.dataclass(frozen=True)
-class Recipe:
+class StageRecipe:
     """How one entry of a method's variables is trained.
 
     Attributes:
@@ -116,7 +116,7 @@ class Variant:
 
     summary: str
     factory: Callable[..., Method]
-    stages: Mapping[str, Recipe] = dataclasses.field(default_factory=dict)
+    stages: Mapping[str, StageRecipe] = dataclasses.field(default_factory=dict)
     presets: Table = dataclasses.field(default_factory=dict)
     page: Page | None = None
     tuned: bool = False

@@ -12,7 +12,7 @@ from experiments.classes import QUESTIONS, class_remark, evaluate_classes
 from experiments.evaluate import Clip
 from experiments.report.classes import write_class_sheet
 from experiments.settings import Settings
-from experiments.variants.base import Found, Page, Recipe, Variant
+from experiments.variants.base import Found, Page, StageRecipe, Variant
 
 
 def thresholds(settings: Settings) -> Thresholds:
@@ -34,8 +34,8 @@ VARIANTS = {
         "classifier-guided supersampling: classes say what becomes of history; every frame rendered",
         methods.classifier,
         {
-            "classifier": Recipe(classification_objective, given=lambda s: {"thresholds": thresholds(s)}, ranges=True),
-            "composition": Recipe(composition_objective),
+            "classifier": StageRecipe(classification_objective, given=lambda s: {"thresholds": thresholds(s)}, ranges=True),
+            "composition": StageRecipe(composition_objective),
         },
         {
             #                                    smoke quick paper

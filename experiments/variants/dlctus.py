@@ -5,7 +5,7 @@ from typing import Any
 
 from essjax import methods
 from essjax.train import dlctus_objective
-from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.base import Page, StageRecipe, Variant
 
 EPOCHS = 200
 PRESETS = {
@@ -22,7 +22,7 @@ PRESETS = {
 def _trained(summary: str, *, theta: float | None = None, page: Page | None = None, **options: Any) -> Variant:
     objective = dlctus_objective if theta is None else partial(dlctus_objective, theta=theta)
     factory = partial(methods.dlctus, **options) if options else methods.dlctus
-    return Variant(summary, factory, {"dlctus": Recipe(objective)}, PRESETS, page=page)
+    return Variant(summary, factory, {"dlctus": StageRecipe(objective)}, PRESETS, page=page)
 
 
 def _at_test_time(summary: str, **options: Any) -> Variant:

@@ -6,7 +6,7 @@ from functools import partial
 from essjax import methods
 from essjax.interfaces import Method
 from essjax.train import cosine, extranet_objective
-from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.base import Page, StageRecipe, Variant
 
 EPOCHS, FIRST_EPOCHS = 150, 20
 """Of the paper: all (Table 3), and the first ones, after which the cosine decay starts (section 4.6)."""
@@ -29,7 +29,7 @@ def _variant(
     parts: Mapping[str, Mapping[str, str]] | None = None,
 ) -> Variant:
     return Variant(
-        summary, factory, {"extranet": Recipe(objective, decay=DECAY)}, PRESETS, page=page, parts=parts or {}
+        summary, factory, {"extranet": StageRecipe(objective, decay=DECAY)}, PRESETS, page=page, parts=parts or {}
     )
 
 

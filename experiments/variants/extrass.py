@@ -4,7 +4,7 @@ from essjax import methods
 from essjax.losses import vgg16_features
 from essjax.train import extrass_objective, frnet_objective
 from experiments.settings import Settings
-from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.base import Page, StageRecipe, Variant
 
 FRNET = {
     #                       smoke quick paper
@@ -25,8 +25,8 @@ VARIANTS = {
         "ExtraSS: G-buffer guided warp, FRNet, ExtraSSNet; every frame at twice the size from half of the frames",
         methods.extrass,
         {
-            "frnet": Recipe(frnet_objective, method=_low),
-            "extrassnet": Recipe(extrass_objective, vgg=vgg16_features),
+            "frnet": StageRecipe(frnet_objective, method=_low),
+            "extrassnet": StageRecipe(extrass_objective, vgg=vgg16_features),
         },
         {
             #                                    smoke quick  paper
@@ -53,7 +53,7 @@ VARIANTS = {
     "extrass-e": Variant(
         "guided warp + FRNet, extrapolates at low resolution",
         methods.extrass_e,
-        {"frnet": Recipe(frnet_objective)},
+        {"frnet": StageRecipe(frnet_objective)},
         {"method.width": (8, 16, 24), **FRNET},
         page=Page(
             "ExtraSS 2023",

@@ -5,7 +5,7 @@ from functools import partial
 from essjax import methods
 from essjax.train import extranet_objective, fasset_objective, halving, nsrr_objective
 from essjax.train.objectives.extranet import reference_shading
-from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.base import Page, StageRecipe, Variant
 from experiments.variants.extranet import DECAY
 from experiments.variants.nsrr import features
 
@@ -24,7 +24,7 @@ PRESETS = {
 
 
 def _variant(summary: str, *, page: Page | None = None, **options: bool) -> Variant:
-    recipe = Recipe(fasset_objective, decay=partial(halving, times=EPOCHS // EPOCHS_PER_HALVING))
+    recipe = StageRecipe(fasset_objective, decay=partial(halving, times=EPOCHS // EPOCHS_PER_HALVING))
     factory = partial(methods.fasset, **options) if options else methods.fasset
     return Variant(summary, factory, {"fasset": recipe}, PRESETS, page=page)
 
@@ -33,7 +33,7 @@ VARIANTS = {
     "extranet-plus": Variant(
         "ExtraNet at output resolution on zero-upsampled frames",
         methods.extranet_plus,
-        {"extranet_plus": Recipe(partial(extranet_objective, target_shading=reference_shading), decay=DECAY)},
+        {"extranet_plus": StageRecipe(partial(extranet_objective, target_shading=reference_shading), decay=DECAY)},
         {
             #                                  smoke quick paper
             "extranet_plus.batch":            (2,    2,    8),
@@ -65,8 +65,8 @@ VARIANTS = {
         "ExtraNet at low resolution, then NSRR on every frame",
         methods.extranet_nsrr,
         {
-            "extranet": Recipe(extranet_objective, method=lambda settings: methods.extranet(), decay=DECAY),
-            "nsrr": Recipe(
+            "extranet": StageRecipe(extranet_objective, method=lambda settings: methods.extranet(), decay=DECAY),
+            "nsrr": StageRecipe(
                 partial(nsrr_objective, half=True),
                 unrolls=lambda s: methods.nsrr(scale=s.data.scale, width=s.method.width, half=True),
                 vgg=features,

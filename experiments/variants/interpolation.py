@@ -3,7 +3,7 @@
 from essjax import methods
 from essjax.interfaces import Method
 from essjax.train import ifrnet_objective
-from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.base import Page, StageRecipe, Variant
 
 
 def _ifrnet_taa(*, width: int = 24) -> Method:
@@ -14,7 +14,7 @@ VARIANTS = {
     "ifrnet": Variant(
         "IFRNet: interpolation by learned optical flow, without G-buffers, low resolution (+1 frame of latency)",
         methods.ifrnet,
-        {"ifrnet": Recipe(ifrnet_objective)},
+        {"ifrnet": StageRecipe(ifrnet_objective)},
         {
             # 300 epochs, batch 24, crops of 224, Adam 1e-4 as published, on ExtraSS's epochs.
             #                        smoke     quick     paper

@@ -6,7 +6,7 @@ from essjax import methods
 from essjax.losses import vgg16_features
 from essjax.train import nsrr_objective
 from essjax.train.objectives.nsrr import VGG_LAYERS
-from experiments.variants.base import Page, Recipe, Variant
+from experiments.variants.base import Page, StageRecipe, Variant
 
 features = partial(vgg16_features, layers=VGG_LAYERS)
 """Of its perceptual term."""
@@ -15,7 +15,7 @@ VARIANTS = {
     "nsrr": Variant(
         "NSRR: a U-Net over five frames, supersampling with every frame rendered (twice the input)",
         partial(methods.nsrr, half=False),
-        {"nsrr": Recipe(partial(nsrr_objective, half=False), vgg=features)},
+        {"nsrr": StageRecipe(partial(nsrr_objective, half=False), vgg=features)},
         {
             # 300 epochs as in thesis 002; crops of 256 output pixels, Adam 1e-4 as published.
             #                        smoke     quick     paper
