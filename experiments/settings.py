@@ -47,10 +47,10 @@ class Data:
 class Training:
     """What all stages share.
 
-    optimizer: of ``essjax.train.OPTIMIZERS``. anneal: their learning rates decay. save_every: seconds between checkpoints. average: decay of a moving average of
-    the weights over the steps; None: the last weights. validations: how often after the start of each stage, equally
-    apart in its budget, the averaged weights play a few frames of each validation clip: the best are kept; None: never,
-    the last are. vgg: path of VGG-16 weights.
+    optimizer: of ``essjax.train.OPTIMIZERS``. anneal: the learning rates decay. save_every: seconds between
+    checkpoints. average: decay of a moving average of the weights over the steps; None: the last weights. validations:
+    how often after the start of each stage, equally apart in its budget, the averaged weights play a few frames of each
+    validation clip: the best are kept; None: never, the last are. vgg: path of VGG-16 weights.
     """
 
     optimizer: Literal["muon", "adam"]

@@ -34,7 +34,9 @@ VARIANTS = {
         "classifier-guided supersampling: classes say what becomes of history; every frame rendered",
         methods.classifier,
         {
-            "classifier": StageRecipe(classification_objective, given=lambda s: {"thresholds": thresholds(s)}, ranges=True),
+            "classifier": StageRecipe(
+                classification_objective, given=lambda s: {"thresholds": thresholds(s)}, ranges=True
+            ),
             "composition": StageRecipe(composition_objective),
         },
         {

@@ -22,8 +22,8 @@ AT = (0.0, 0.2, 0.5, 0.8, 1.0)
 """Progress at which decays are sampled."""
 DATA = (
     "seed", "size", "scale", "train_sequences", "validation_sequences", "test_sequences", "train_frames", "test_frames",
-    "train_spp", "test_spp", "mip_bias", "jitter", "fresh", "optimizer", "save_every", "average", "validations", "tune", "warmup",
-    "pictures", "optimize",
+    "train_spp", "test_spp", "mip_bias", "jitter", "fresh", "optimizer", "save_every", "average", "validations", "tune",
+    "warmup", "pictures", "optimize",
 )  # fmt: skip
 
 

@@ -179,3 +179,13 @@ def test_a_value_is_replaced_where_it_stands():
     other = with_value(settings, "method.clamp", "none")
     assert other.method.clamp == "none" and settings.method.clamp == "ycocg"
     assert with_value(other, "method.clamp", "ycocg") == settings
+
+
+def test_optimizers_are_those_that_there_are():
+    """Named in the settings as well, which must not wait for JAX."""
+    from essjax.train import OPTIMIZERS
+
+    for name in OPTIMIZERS:
+        assert settings_of("extrass", "quick", [f"training.optimizer={name}"]).training.optimizer == name
+    with pytest.raises(ValueError, match=r"training.optimizer: expected Literal\['muon', 'adam'\], got 'sgd'"):
+        settings_of("extrass", "quick", ["training.optimizer=sgd"])
