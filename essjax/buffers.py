@@ -48,7 +48,7 @@ BUFFERS = {
 }
 """Images of a frame, in the order in which files and messages list them."""
 MASKS = ("valid", "steady")
-"""What a sequence knows beside its frames; one channel each, ``Y``."""
+"""Masks of a sequence, beside its frames; one channel each, ``Y``."""
 RANGES = {
     "depth_min": "Z", "depth_max": "Z", "color_min": "RGB", "color_max": "RGB", "normal_spread": "Y",
     "normal_spread_smooth": "Y", "motion": "XY",

@@ -86,7 +86,7 @@ def plan(
 
 
 def _check_request(out: Path, clips: Sequence[Clip], settings: dict) -> dict[str, list]:
-    """The splits that are there already; a ValueError where the request contradicts them."""
+    """Read the splits that are there already; a ValueError where the request contradicts them."""
     if len({clip.name for clip in clips}) != len(clips):
         raise ValueError("generate: two clips have the same split, family and seed.")
     if not (out / "dataset.json").is_file():
@@ -176,7 +176,7 @@ def live_source(
     jitter: str = "halton",
     on_frame: Callable[[int], Any] | None = None,
 ) -> CachedSource:
-    """A source for ``data.clips`` that renders each clip when first asked for it, without touching the disk.
+    """Make a source for ``data.clips`` that renders each clip when first asked for it, without touching the disk.
 
     Args:
       clips: from ``plan``.

@@ -23,7 +23,7 @@ _console = Console()
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar of frames; yields a function of (done, total)."""
+    """Show a progress bar of frames; yields a function of (done, total)."""
     columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=_console) as bar:
         task = bar.add_task(title, total=None)
@@ -58,7 +58,7 @@ def parse_split(text: str, option: str) -> tuple[int, int] | list[str]:
 
 
 def _check_folder(path: Path, option: str) -> None:
-    """A ValueError unless files can be written into a folder, or it can be made; before the work that fills it."""
+    """Raise a ValueError unless a folder can take files, or can be made; before the work that fills it."""
     there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
     if not there.is_dir():
         raise ValueError(f"{option}: expected a folder, but {there} is a file.")

@@ -12,7 +12,7 @@ ALBEDO_FLOOR = 0.04
 def demodulation_albedo(
     base_color: Color, background: Array, metallic: Plane | None = None, specular: Plane | None = None
 ) -> Color:
-    """What shading is divided by before a warp and multiplied with after it (ExtraSS section 4.2).
+    """Return the divisor of shading before a warp, its factor after it (ExtraSS section 4.2).
 
     ``base_color + 0.08 * specular * (1 - metallic)``, at least ``ALBEDO_FLOOR``; 1 on the background, so that sky is
     neither demodulated nor modulated.
@@ -114,7 +114,7 @@ def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:
 
 
 def srgb_encode(linear: Image) -> Image:
-    """The sRGB transfer function (IEC 61966-2-1) on [0, 1]; finite gradient at 0."""
+    """Apply the sRGB transfer function (IEC 61966-2-1) on [0, 1]; finite gradient at 0."""
     safe = jnp.maximum(linear, 0.0031308)
     return jnp.where(linear <= 0.0031308, 12.92 * linear, 1.055 * safe ** (1.0 / 2.4) - 0.055)
 
@@ -126,7 +126,7 @@ def srgb_decode(encoded: Image) -> Image:
 
 
 def display(color: Image) -> Image:
-    """What a viewer sees and what metrics score: ``srgb_encode(reinhard(color))``, in [0, 1)."""
+    """Show colour as viewers see it and metrics score it: ``srgb_encode(reinhard(color))``, in [0, 1)."""
     return srgb_encode(reinhard(color))
 
 

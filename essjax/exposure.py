@@ -16,7 +16,7 @@ from essjax.interfaces import Method, Parts, Step, from_parts
 from essjax.typing import Array, Callable, Color, Flag, PyTree, Scalar, pytree
 
 GREY = 0.18
-"""What the mean luminance becomes."""
+"""The exposed mean luminance."""
 DARK = 0.01
 """A pixel of this share of the frame's mean luminance counts half: black must not rule a night scene."""
 
@@ -61,13 +61,13 @@ class Meter:
 
 
 def start_meter(example: Frame) -> Meter:
-    """A meter that has seen nothing: exposure 1."""
+    """Start a meter that has seen nothing: exposure 1."""
     zero = jnp.zeros(example.cut.shape, jnp.float32)
     return Meter(log_mean=zero + math.log(GREY), count=zero)
 
 
 def read_meter(meter: Meter, frame: Frame) -> tuple[Meter, Scalar]:
-    """The meter after ``frame``, and the frame's exposure: it counts itself if it has colour.
+    """Show ``frame`` to the meter; returns it and the frame's exposure, in which its own colour counts.
 
     A cut starts a new mean. Until the new shot has shown any light, the exposure stays what it was.
     """
@@ -95,14 +95,14 @@ class Metered:
 
 
 def _assumed(example: Frame) -> Frame:
-    """``example`` with an exposure, 1 where it has none: for what only depends on shapes."""
+    """Give ``example`` an exposure, 1 where it has none: for what only depends on shapes."""
     if example.exposure is not None:
         return example
     return dataclasses.replace(example, exposure=jnp.ones(example.cut.shape, jnp.float32))
 
 
 def metered(method: Method) -> Method:
-    """``method``, whose frames need an exposure, for frames without one: it is metered from those rendered so far.
+    """Let ``method`` take frames without an exposure: it is metered from those rendered so far.
 
     Frames with an exposure are passed on as they are, and the history is the method's own.
     """
@@ -133,7 +133,7 @@ def metered(method: Method) -> Method:
 
 
 def _metered_parts(method: Method, parts: Parts) -> Method:
-    """The same of a method that is made of parts: its memory is ``Metered``."""
+    """Do the same for a method that is made of parts: its memory is ``Metered``."""
 
     def init(key, example):
         return method.init(key, _assumed(example))
@@ -169,7 +169,7 @@ def _no_radiance(function: Callable[[Array], Array], history: PyTree) -> PyTree:
 
 
 def exposed(method: Method, map_radiance: MapRadiance = _no_radiance) -> Method:
-    """``method``, which works on exposed colour, for scene radiance in any unit; ``metered`` where none is recorded.
+    """Let ``method``, which works on exposed colour, take radiance in any unit; ``metered`` where none is recorded.
 
     Colour is multiplied by the frame's exposure before the step, the image divided after it. Between the steps the
     history is scene radiance, so that it stays true when the exposure changes; the method sees it at the current

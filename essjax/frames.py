@@ -20,7 +20,7 @@ from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree,
 
 @pytree
 class GBuffers:
-    """What the rasteriser knows without shading, at the jittered sample positions.
+    """Everything that the rasteriser knows without shading, at the jittered sample positions.
 
     Only depth is always there: a method names what else it needs in ``MethodInfo.requires``.
 
@@ -76,7 +76,7 @@ class Frame:
 
 @pytree
 class SampleRanges:
-    """What all sub-samples of each reference pixel saw, unjittered: classifier labels are made of it (Guo et al. 2022).
+    """Ranges over the sub-samples of each reference pixel, unjittered, for classifier labels (Guo et al. 2022).
 
     Attributes:
       depth_min: ``[..., sH, sW, 1]`` metres, background +inf.
@@ -128,7 +128,7 @@ class Sequence:
 
 @pytree
 class Prediction:
-    """What a step returns.
+    """The result of a step.
 
     Attributes:
       image: ``[..., round(scale * H), round(scale * W), 3]`` linear HDR.
@@ -143,7 +143,7 @@ class Prediction:
 
 
 def frame_images(frame: Frame) -> dict[str, jax.Array | np.ndarray]:
-    """The images that a frame holds, by name; absent ones are left out."""
+    """Collect the images that a frame holds, by name; absent ones are left out."""
     images = {"color": frame.color, "motion": frame.motion, "reactive": frame.reactive}
     images |= {field.name: getattr(frame.gbuffers, field.name) for field in dataclasses.fields(frame.gbuffers)}
     return {name: image for name, image in images.items() if image is not None}
@@ -159,7 +159,7 @@ def gbuffers_of(images: Mapping[str, Any]) -> GBuffers:
 
 
 def surface_guides(gbuffers: GBuffers) -> tuple[Color, Vectors]:
-    """Base colour and normal; a ValueError that says which one is missing."""
+    """Return base colour and normal; a ValueError says which one is missing."""
     if gbuffers.base_color is None or gbuffers.normal is None:
         missing = [name for name in ("base_color", "normal") if getattr(gbuffers, name) is None]
         raise ValueError(f"guided warps need the buffers {', '.join(missing)}, which these frames do not have.")
@@ -167,7 +167,7 @@ def surface_guides(gbuffers: GBuffers) -> tuple[Color, Vectors]:
 
 
 def rendered_color(frame: Frame, name: str) -> Color:
-    """The colour of a rendered frame; a ValueError that names the method ``name`` if it has none."""
+    """Return the colour of a rendered frame; a ValueError names the method ``name`` if it has none."""
     if frame.color is None:
         raise ValueError(f"{name}: a rendered step needs the frame's colour, got None. Call its extrapolate_step.")
     return frame.color
@@ -343,7 +343,7 @@ def select_time(tree: PyTree, index: int | slice) -> PyTree:
 
 
 def without_color(frame: Frame) -> Frame:
-    """The frame as an extrapolating step sees it: its colour leaf is None."""
+    """Remove the colour: the frame as an extrapolating step sees it."""
     return dataclasses.replace(frame, color=None)
 
 

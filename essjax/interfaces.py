@@ -39,7 +39,7 @@ class Start(Protocol):
 
 
 class MethodInfo(NamedTuple):
-    """What a caller must know of a method.
+    """Facts that a caller must know of a method.
 
     Attributes:
       name: as in ``--variant``.
@@ -146,7 +146,7 @@ class Method(NamedTuple):
 
 
 def from_parts(init: Init, start: Start, parts: Parts, info: MethodInfo) -> Method:
-    """A method whose steps are its parts, one after the other; ``start`` gives a ``Parted``."""
+    """Make a method whose steps are its parts, one after the other; ``start`` gives a ``Parted``."""
 
     def step(variables: PyTree, history: Parted, frame: Frame, train: bool) -> tuple[Parted, Prediction]:
         memory, notes = parts.remember(history.memory, frame)
@@ -165,7 +165,7 @@ def from_parts(init: Init, start: Start, parts: Parts, info: MethodInfo) -> Meth
 
 
 def expand_flag(flag: Flag, ndim: int) -> Array:
-    """A flag ``[...]`` with axes appended until it broadcasts against an array of ``ndim`` axes."""
+    """Append axes to a flag ``[...]`` until it broadcasts against an array of ``ndim`` axes."""
     return flag.reshape(flag.shape + (1,) * (ndim - flag.ndim))
 
 
@@ -175,13 +175,13 @@ def reset_at_cut(cut: Flag, fresh: PyTree, history: PyTree) -> PyTree:
 
 
 def no_variables(key: Key, example: Frame) -> dict:
-    """The ``init`` of a heuristic: nothing to learn."""
+    """Serve as the ``init`` of a heuristic: nothing to learn."""
     del key, example
     return {}
 
 
 def refuse_extrapolation(name: str) -> Step:
-    """The ``extrapolate_step`` of a method that needs colour in every frame: raises a ValueError that says so."""
+    """Make the ``extrapolate_step`` of a method that needs colour in every frame: it raises a ValueError."""
 
     def extrapolate_step(variables, history, frame, *, train=False):
         raise ValueError(f"{name} cannot extrapolate: it needs the colour of every frame. Use schedule every().")

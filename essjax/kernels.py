@@ -18,7 +18,7 @@ _plain: contextvars.ContextVar[bool] = contextvars.ContextVar("plain", default=F
 
 @contextlib.contextmanager
 def plain() -> Iterator[None]:
-    """What is traced inside is what every backend runs: no kernels, nothing padded for a GPU.
+    """Trace what every backend runs: no kernels, nothing padded for a GPU.
 
     To compare with, and to count work. Enter it inside the function that is jitted: jit's cache does not know of it.
     """

@@ -52,7 +52,7 @@ class Thresholds(NamedTuple):
 
     @classmethod
     def of_height(cls, height: int) -> "Thresholds":
-        """The paper's, which we take to be of 1080 rows, for images of ``height`` rows (docs/deviations.md).
+        """Scale the paper's, which we take to be of 1080 rows, to images of ``height`` rows (docs/deviations.md).
 
         From pixel to pixel a plane's depth changes the more the fewer there are: with the same T_D^A all of a floor
         would be an edge (34 % of the pixels of 136 rows, 10 % with this one). A shadow's edge moves by fewer pixels.
@@ -79,12 +79,12 @@ class Labels:
 
 
 def _closeness(depth: Plane) -> Plane:
-    """The paper's D: 1 / depth, 0 on the background."""
+    """Compute the paper's D: 1 / depth, 0 on the background."""
     return jnp.where(jnp.isfinite(depth), 1.0 / depth, 0.0)
 
 
 def _neighbours(image: Image, outside) -> list[Image]:
-    """The images whose pixel (y, x) is the eight neighbours of (y, x); ``outside`` where there is none."""
+    """Return the images whose pixel (y, x) is one of the neighbours of (y, x); ``outside`` where there is none."""
     height, width = image.shape[-3:-1]
     padded = jnp.pad(image, [(0, 0)] * (image.ndim - 3) + [(1, 1), (1, 1), (0, 0)], constant_values=outside)
     offsets = [(dy, dx) for dy in range(3) for dx in range(3) if (dy, dx) != (1, 1)]

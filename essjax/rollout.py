@@ -47,7 +47,7 @@ def alternate(parity: int = 0) -> Schedule:
 
 @pytree
 class Rollout:
-    """What ``unroll`` returns, time-major.
+    """The result of ``unroll``, time-major.
 
     Attributes:
       image: ``[T, ..., h, w, 3]``, frame n's image at index n whatever the method's latency.
@@ -155,7 +155,7 @@ def unroll(
 
 
 def _scan_parts(parts: Parts, variables: PyTree, history: Parted, body: Frame, kinds: tuple[str, ...], keep, remat):
-    """The scan of ``unroll`` in training, ``body`` ``[periods, frames of a period, ...]``: all frames are observed at
+    """Scan as ``unroll`` does in training, ``body`` ``[periods, frames of a period, ...]``: all frames are observed at
     once, so that the loop that gradients go through holds only what depends on earlier output.
     """
 
@@ -185,7 +185,7 @@ def _scan_parts(parts: Parts, variables: PyTree, history: Parted, body: Frame, k
 
 
 Collected = dict[str, dict[str, PyTree]]
-"""What frames that follow each other gave, leaves ``[frames, ...]``: "image" -> "" -> images, "aux" -> kind -> what was
+"""Results of frames in a row, leaves ``[frames, ...]``: "image" -> "" -> images, "aux" -> kind -> what was
 kept, "state" -> entry -> statistics."""
 
 
@@ -215,12 +215,12 @@ def _join(parts: list[Collected]) -> Collected:
 
 
 def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
-    """Indices of the frames of one kind."""
+    """List the indices of the frames of one kind."""
     return [n for n, k in enumerate(kinds) if k == kind]
 
 
 def bake(method: Method, variables: PyTree) -> Method:
-    """``method`` with trained ``variables`` built in, for streaming and shipping; its own variables are ``{}``.
+    """Build trained ``variables`` into ``method``, for streaming and shipping; its own variables are ``{}``.
 
     They become constants of the compiled step: what depends on them alone (rounding, layouts) is computed when it is
     compiled, and a call passes fewer arguments. The steps cannot be trained any more.

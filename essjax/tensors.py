@@ -30,7 +30,7 @@ _STORAGES = {
 
 
 def read_tensors(path: str | Path, what: str = "weights", *, prefix: str = "") -> dict[str, np.ndarray]:
-    """The arrays of a weight file by name.
+    """Read the arrays of a weight file by name.
 
     A PyTorch file may hold a state dict or a checkpoint with one under ``state_dict``. bfloat16 becomes float32.
 
@@ -69,7 +69,7 @@ def _read_safetensors(path: Path, prefix: str) -> dict[str, np.ndarray]:
 
 
 def map_safetensors(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a safetensors file by name, read from the disk where they are used (bfloat16 at once).
+    """Map the arrays of a safetensors file by name, read from the disk where they are used (bfloat16 at once).
 
     safetensors' own reader has no bfloat16 for NumPy and copies everything.
     """
@@ -112,7 +112,7 @@ def _read_torch(path: Path, prefix: str) -> dict[str, np.ndarray]:
 
 
 def _rebuild_tensor(storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_) -> np.ndarray:
-    """A strided view of a storage, copied. Its bounds are checked: a file must not read other memory."""
+    """Copy a strided view of a storage. Its bounds are checked: a file must not read other memory."""
     size, stride = tuple(map(int, size)), tuple(map(int, stride))
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if math.prod(size) and not (min((offset, *size, *stride)) >= 0 and last < storage.size):
@@ -140,13 +140,13 @@ class _Unpickler(pickle.Unpickler):
         self._archive, self._folder = archive, folder
 
     def find_class(self, module_name: str, global_name: str) -> Any:
-        """What a name in the pickle stands for."""
+        """Look up what a name in the pickle stands for."""
         if (module_name, global_name) not in self.ALLOWED:
             raise ValueError(f"it names {module_name}.{global_name}, which a state dict does not need: not loaded")
         return self.ALLOWED[module_name, global_name]
 
     def persistent_load(self, pid: Any) -> np.ndarray:
-        """A storage, from its own file in the archive."""
+        """Read a storage from its own file in the archive."""
         kind, storage, key, _, count = pid
         if kind != "storage" or storage not in _STORAGES:
             raise ValueError(f"unknown entry {kind} {storage}")
@@ -160,4 +160,4 @@ _ERRORS = (
     OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, IndexError, pickle.UnpicklingError,
     zipfile.BadZipFile,
 )  # fmt: skip
-"""What readers raise on damaged files."""
+"""The exceptions that readers raise on damaged files."""

@@ -1,4 +1,4 @@
-"""What a method costs where it runs."""
+"""The cost of a method where it runs."""
 
 from essjax.deploy.cost import Cost, count_parameters, method_cost, multiply_adds
 

@@ -13,7 +13,7 @@ from essjax.typing import PyTree
 
 
 class Cost(NamedTuple):
-    """What one method costs.
+    """The cost of one method.
 
     Attributes:
       parameters: trained numbers, BatchNorm statistics aside.
@@ -27,7 +27,7 @@ class Cost(NamedTuple):
 
 
 def _jaxprs(value: Any):
-    """The programs inside an equation's parameter."""
+    """Yield the programs inside an equation's parameter."""
     if hasattr(value, "eqns"):
         yield value
     elif hasattr(value, "jaxpr"):
@@ -83,7 +83,7 @@ def _depends(function, arguments: tuple, which: int) -> bool:
 
 
 def method_cost(method: Method, width: int, height: int) -> Cost:
-    """What ``method`` costs per frame of ``width`` x ``height`` input pixels (native ones for native methods)."""
+    """Count what ``method`` costs per frame of ``width`` x ``height`` input pixels (native ones for native methods)."""
     frame = example_frame(width, height)
     variables = jax.eval_shape(method.init, jax.random.key(0), frame)
     history = jax.eval_shape(method.start, frame)

@@ -9,7 +9,7 @@ from essjax.typing import Array, Color, Image, Mask
 
 
 def temporal_l1(image: Color, warped_previous: Color, valid: Mask) -> Color:
-    """``valid * |image - warped_previous|``, ``[..., H, W, 3]``: the first term of ExtraSS eq 13.
+    """Compute ``valid * |image - warped_previous|``, ``[..., H, W, 3]``: the first term of ExtraSS eq 13.
 
     Our reading: masked, because where the warped history shows another surface an unmasked term rewards ghosting.
     Reduce it with ``masked_mean(..., valid)``.

@@ -34,7 +34,7 @@ LAYERS = tuple(f"relu{block}_{conv}" for block, conv in _CONVOLUTIONS)
 def vgg16_features(
     weights_path: str | Path, *, layers: tuple[str, ...] = ("relu2_2",)
 ) -> Callable[[Color], list[Image]]:
-    """A feature function of linear HDR images for ``perceptual``: VGG-16 activations (Simonyan and Zisserman 2015).
+    """Make a feature function of linear HDR for ``perceptual``: VGG-16 activations (Simonyan and Zisserman 2015).
 
     The image is made display-referred (``color.display``), clipped to [0, 1] and normalised as ImageNet was. The
     default layer is the one of Johnson et al. 2016's feature reconstruction loss, whom ExtraSS eq 12 cites.

@@ -62,7 +62,7 @@ class History:
 
 
 def map_colors(function: Callable[[Array], Array], history: History) -> History:
-    """``function`` of the three colours of a history."""
+    """Apply ``function`` to the three colours of a history."""
     colors = {name: function(getattr(history, name)) for name in ("image", "low", "high")}
     return dataclasses.replace(history, **colors)
 
@@ -114,7 +114,7 @@ def closeness(frame: Frame, scale: Array) -> Plane:
 
 
 def look(frame: Frame, unit: Array, scale: int, sigma: float) -> Current:
-    """The frame's buffers at the output's resolution (section 3)."""
+    """Bring the frame's buffers to the output's resolution (section 3)."""
     color = reinhard(rendered_color(frame, "classifier"))
     samples = gaussian_resample(color, rgb_to_ycocg(color), frame.jitter, jnp.float32(sigma), scale)
     motion = upsample_motion(
@@ -154,7 +154,7 @@ def depth_difference(reprojected: Plane, current: Plane) -> Plane:
 
 
 def classifier_inputs(current: Current, warped: Warped) -> Image:
-    """The classifier's 20 channels (section 3), at the output's resolution, each about in [-1, 1]."""
+    """Make the classifier's 20 channels (section 3), at the output's resolution, each about in [-1, 1]."""
     motion = current.motion
     return jnp.concatenate(
         [
@@ -188,7 +188,7 @@ def rectify(image: Color, current: Current, ghosting: Image) -> Color:
 
 
 def blending_prior(counter: Plane, weight: Mask, alpha: float) -> Plane:
-    """The current sample's share before training: an average of the frames so far, at least ``alpha * weight``."""
+    """Return the current sample's share before training: an average so far, at least ``alpha * weight``."""
     return jnp.clip(jnp.maximum(alpha * weight, 1.0 / (1.0 + counter)), 0.02, 0.98)
 
 

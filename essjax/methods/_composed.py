@@ -103,7 +103,7 @@ def composed(
 
 
 def settled(method: Method) -> Method:
-    """``method`` with the variables that its ``init`` gives, as constants: a heuristic with its default settings."""
+    """Fix the variables that ``init`` gives ``method`` as constants: a heuristic with its default settings."""
 
     def with_own(step: Step) -> Step:
         def run(variables, history, frame, *, train=False):

@@ -74,7 +74,7 @@ returning_clip.defvjp(_returning_clip_forward, _returning_clip_backward)
 
 
 def map_color(function: Callable[[Array], Array], history: dict) -> dict:
-    """``function`` of the colour of a history, which is linear; its fourth channel stays as it is."""
+    """Apply ``function`` to the colour of a history, which is linear; its fourth channel stays as it is."""
     image = history["image"]
     return {**history, "image": jnp.concatenate([function(image[..., :3]), image[..., 3:]], axis=-1)}
 

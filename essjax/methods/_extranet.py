@@ -35,7 +35,7 @@ ENGINE = (1.0, -1.0, 1.0)
 
 @pytree
 class Kept:
-    """What is kept of a rendered frame.
+    """All that is kept of a rendered frame.
 
     Attributes:
       shading: demodulated colour ``[..., H, W, 3]``.
@@ -48,7 +48,7 @@ class Kept:
 
 @pytree
 class Inputs:
-    """What the network sees of an extrapolated frame; colours demodulated, log1p.
+    """All that the network sees of an extrapolated frame; colours demodulated, log1p.
 
     Attributes:
       warped: newest rendered frame by plain motion, ``[..., H, W, 3]``, and by occlusion motion, 3 more.

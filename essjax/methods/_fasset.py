@@ -54,12 +54,12 @@ from essjax.warp import (
 )
 
 SAMPLE_SIGMA = 0.65
-"""Of the Gaussian that tells RenderINR how near a sample is, output pixels."""
+"""Sigma of the Gaussian that tells RenderINR how near a sample is, output pixels."""
 
 
 @pytree
 class Kept:
-    """What is kept of a rendered frame.
+    """All that is kept of a rendered frame.
 
     Attributes:
       shading: demodulated colour, linear, ``[..., H, W, 3]``.
@@ -90,7 +90,7 @@ class History:
 
 
 class Arrival(NamedTuple):
-    """What the history shows at a frame's samples, and at its output pixels.
+    """The history as seen at a frame's samples, and at its output pixels.
 
     Attributes:
       shading: of the last rendered frame, at the samples, log1p.
@@ -132,7 +132,7 @@ def _start(example: Frame, scale: float, width: int) -> History:
 
 
 def _arrive(history: History, frame: Frame, scale: float, width: int) -> tuple[History, Arrival]:
-    """The history with its path extended to ``frame``, and what it shows there."""
+    """Extend the history's path to ``frame``; returns it and what it shows there."""
     fresh, before = _start(frame, scale, width), history.rendered
     before = reset_memory(frame.cut, fresh.rendered, before)
     surfaces = reset_at_cut(frame.cut, fresh.surfaces, history.surfaces)
@@ -155,7 +155,7 @@ def _arrive(history: History, frame: Frame, scale: float, width: int) -> tuple[H
 
 
 def _read(last: Rendered, frame: Frame, scale: float, valid: Mask, trust: Mask) -> dict[str, Array]:
-    """What was kept, each on its own grid: shading at samples, hidden state at pixel centres, the image at output size.
+    """Read what was kept on its own grid: shading at samples, hidden state at pixel centres, image at output size.
 
     Held on unjittered grids, what is written in one frame is read in another as it was; from samples to samples it
     would be blurred by each new jitter.
@@ -198,7 +198,7 @@ def _into_box(image: Color, samples: Color, jitter: Jitter, scale: float) -> Col
 
 
 def _around(image: Image, choose: Callable[[Array, Array], Array]) -> Image:
-    """The smallest or largest value of each 3x3 neighbourhood, the border repeated."""
+    """Take the smallest or largest value of each 3x3 neighbourhood, the border repeated."""
     for axis in (-3, -2):
         size = image.shape[axis]
         before, after = (jnp.clip(jnp.arange(size) + step, 0, size - 1) for step in (-1, 1))
@@ -277,7 +277,7 @@ def fasset(
         return {"fasset": network.init(key, *shapes)}
 
     def predict(variables, history, frame, shading, mask, arrival, near, train, task):
-        """The output as log1p, the new hidden state and statistics; ``shading`` (log1p) is not read in holes."""
+        """Predict the output as log1p, the new hidden state, statistics; ``shading`` (log1p) is not read in holes."""
         texture = albedo(frame.gbuffers)
         filled = log1p(modulate(expm1(fill_holes(shading, mask)), texture))
         base = jax.lax.stop_gradient(jitter_aligned_upsample(filled, scale, frame.jitter))

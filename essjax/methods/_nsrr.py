@@ -39,7 +39,7 @@ class History:
 
 
 def warp_previous(rendered: Memory, frame: Frame, scale: int) -> Image:
-    """The previous frames' features at the output pixels of ``frame``, ``[4, ..., sH, sW, FEATURES]``.
+    """Warp the previous frames' features to the output pixels of ``frame``, ``[4, ..., sH, sW, FEATURES]``.
 
     What zero-upsampling each and warping it by its motion (composed at low resolution, upsampled bilinearly) gives; 0
     where a path leads outside or was reactive, and where no sample of that frame fell next to its end.

@@ -32,12 +32,12 @@ RECTIFICATIONS = ("clamp", "clip")
 KERNELS = ("gaussian", "tent")
 ACCUMULATIONS = ("bounded", "constant", "average")
 UPSAMPLED_WEIGHT = 1e-3
-"""What a jitter-aligned upsampled colour counts as where no sample of its frame fell into the pixel (β = 0): history
+"""The weight of a jitter-aligned upsampled colour where no sample of its frame fell into the pixel (β = 0): history
 that the first sample replaces."""
 
 
 class Settings(NamedTuple):
-    """What is fixed at trace time; see ``taau``."""
+    """Settings that are fixed at trace time; see ``taau``."""
 
     scale: int
     clamp: str
@@ -91,7 +91,7 @@ def _path(history: PyTree, frame: Frame, settings: Settings) -> tuple[Array, Arr
 def _reproject(
     history: PyTree, motion: Array, trust: Array | None, frame: Frame, settings: Settings
 ) -> tuple[Array, Array]:
-    """The history's image at the current frame's pixels, x / (1 + x), and its count: 0 where none (off screen, cut)."""
+    """Read the history's image at the current pixels, x / (1 + x), and its count: 0 where none (off screen, cut)."""
     color = jnp.clip(backward_warp(reinhard(history["color"]), motion, mode=settings.history_mode), 0.0, 1.0)
     count = backward_warp(history["count"], motion) * inside_mask(motion)
     count = count if trust is None else count * trust
@@ -269,7 +269,7 @@ def taa(
 
 @registered
 def tus(*, scale: int = 2, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
-    """The TUS row of thesis 002 (section 5.3.1): history clamping, bicubic reprojection (a = -0.75), no dilation.
+    """Make the TUS row of thesis 002 (section 5.3.1): history clamping, bicubic (a = -0.75), no dilation.
 
     Constant α, and history that is started and padded with the jitter-aligned upsampled frame, as in ``dlctus``. Our
     reading of what is not said: the Gaussian, and the clamp's box in RGB. On the built-in scenes at 2x2 (validation,

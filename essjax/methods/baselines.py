@@ -16,7 +16,7 @@ from essjax.warp import backward_warp, compose_motion, jitter_aligned_upsample, 
 
 
 def jau_image(frame: Frame, scale: float, *, mode: str = "bilinear") -> Array:
-    """The frame's colour upsampled from where its samples lie (JAU, SPEC 4), ``[..., scale H, scale W, 3]``.
+    """Upsample the frame's colour from where its samples lie (JAU, SPEC 4), ``[..., scale H, scale W, 3]``.
 
     Inside x / (1 + x): a highlight then does not bleed over its neighbours and bicubic kernels hardly ring. It is the
     stronger baseline (bilinear on the chess clip: 29.7 dB, on radiance 29.1, after x / (1 + x)).
@@ -26,7 +26,7 @@ def jau_image(frame: Frame, scale: float, *, mode: str = "bilinear") -> Array:
 
 
 def _spatial(name: str, scale: float, upscale: Callable[[Frame], Array]) -> Method:
-    """A method that upscales each rendered frame by itself and repeats it on frames without colour."""
+    """Make a method that upscales each rendered frame by itself and repeats it on frames without colour."""
 
     def start(example: Frame) -> PyTree:
         *leading, height, width, _ = example.motion.shape

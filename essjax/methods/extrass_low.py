@@ -64,7 +64,7 @@ def _store(history: Memory, frame: Frame) -> Memory:
 
 
 def halve(image: Image) -> Image:
-    """The downsampling ⁻ of section 4.3: 2x2 box; odd sizes repeat their last row or column."""
+    """Downsample as ⁻ of section 4.3 does: 2x2 box; odd sizes repeat their last row or column."""
     return mean_pool(pad_to_multiple(image, 2))
 
 
@@ -113,7 +113,7 @@ def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: floa
 
 @pytree
 class Extrapolated:
-    """What the low-resolution part of an ESS frame yields; all linear unless said otherwise.
+    """The results of an ESS frame's low-resolution part; all linear unless said otherwise.
 
     Attributes:
       warp: f_g(i_{t-1}), ``[..., H, W, 3]``.

@@ -1,4 +1,4 @@
-"""What FASSET is compared with (section 4.2): ExtraNet and NSRR in a row, both ways, and ExtraNet at output size."""
+"""Methods that FASSET is compared with (section 4.2): ExtraNet and NSRR both ways, and ExtraNet at output size."""
 
 import dataclasses
 
@@ -85,7 +85,7 @@ def nsrr_extranet(*, scale: int = 2, width: int = 32) -> Method:
 
 
 def _without_gaps(seen: Inputs) -> Inputs:
-    """Inputs whose shading has a fourth channel, 1 where a sample was read: no sample is a hole."""
+    """Give the inputs' shading a fourth channel, 1 where a sample was read: no sample is a hole."""
 
     def found(warped: Image) -> Image:
         return (warped[..., 3:4] > 0).astype(jnp.float32)

@@ -27,7 +27,7 @@ DEPTH_TOLERANCE = 0.1
 
 @pytree
 class Seen:
-    """What is kept of a rendered frame.
+    """All that is kept of a rendered frame.
 
     Attributes:
       color: ``[..., H, W, 3]``.
@@ -63,7 +63,7 @@ class Pair:
 
 @pytree
 class History:
-    """What interpolation remembers.
+    """The memory of interpolation.
 
     Attributes:
       rendered: the last rendered frame and the path to it; its content is a ``Seen``.
@@ -79,7 +79,7 @@ Between = Callable[[PyTree, Pair, bool], tuple[Color, dict[str, PyTree]]]
 
 
 def interpolator(name: str, between: Between, *, init: Init = no_variables) -> Method:
-    """A method of latency 1 that shows every rendered frame and, halfway between two of them, what ``between`` makes.
+    """Make a method of latency 1 that shows each rendered frame and, halfway between two, what ``between`` makes.
 
     It is built for the alternation: of several unrendered frames in a row all but the last repeat the rendered one. So
     does an unrendered frame before a cut, which has no later frame in its shot; one right after a cut, which has no
@@ -135,7 +135,7 @@ def interpolator(name: str, between: Between, *, init: Init = no_variables) -> M
 
 @pytree
 class Candidate:
-    """What one of the two rendered frames shows at the wanted pixels.
+    """One of the two rendered frames, as it is seen at the wanted pixels.
 
     Attributes:
       color: ``[..., H, W, 3]``.
@@ -153,7 +153,7 @@ def _same_surface(first: Plane, second: Plane) -> Flag:
 
 
 def blend(first: Candidate, second: Candidate) -> Color:
-    """The mean where both show the same surface, else the nearer one of those found; the mean again where none is."""
+    """Take the mean where both show the same surface, else the nearer one found; the mean again where none is."""
     same = _same_surface(first.nearness, second.nearness)
     both = (first.found > 0) & (second.found > 0)
     nearer = (first.nearness > second.nearness).astype(jnp.float32)

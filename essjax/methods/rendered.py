@@ -59,7 +59,7 @@ def hole_buffers(gbuffers: GBuffers) -> GBuffers:
 
 
 def start_memory(example: Frame, content: PyTree, frames: int) -> Memory:
-    """A memory of nothing, for ``frames`` frames of the shapes of ``example`` and ``content``."""
+    """Make a memory of nothing, for ``frames`` frames of the shapes of ``example`` and ``content``."""
 
     def repeat(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, (frames, *leaf.shape))
@@ -69,7 +69,7 @@ def start_memory(example: Frame, content: PyTree, frames: int) -> Memory:
 
 
 def _remember(frame: Frame, content: PyTree) -> Rendered:
-    """A frame that was just rendered: no way back to go."""
+    """Remember a frame that was just rendered: no way back to go."""
     return Rendered(
         content=content,
         jitter=frame.jitter,
@@ -134,14 +134,14 @@ def map_shading(function: Callable[[Array], Array], memory: Memory) -> Memory:
 
 
 def albedo(gbuffers: GBuffers) -> Color:
-    """The demodulation divisor of these G-buffers."""
+    """Return the demodulation divisor of these G-buffers."""
     base_color, _ = surface_guides(gbuffers)
     return demodulation_albedo(base_color, background(gbuffers), gbuffers.metallic, gbuffers.specular)
 
 
 @pytree
 class Shading:
-    """What guided warps keep of a rendered frame.
+    """All that guided warps keep of a rendered frame.
 
     Attributes:
       shading: demodulated colour ``[..., H, W, 3]``.

@@ -1,4 +1,4 @@
-"""What a frame may take from those before it: nothing across a cut, and nothing where it is reactive.
+"""The limits of history: a frame takes nothing across a cut, and nothing where it is reactive.
 
 A shot begins with its first *rendered* frame. What comes before that shows ``unlit`` and is not remembered.
 """
@@ -28,7 +28,7 @@ class Shot:
 
 
 def unlit(frame: Frame, scale: float = 1) -> Color:
-    """What a frame shows while nothing was rendered in its shot: its base colour as if lit evenly, else black.
+    """Show a frame while nothing was rendered in its shot: its base colour as if lit evenly, else black.
 
     Base colour over exposure, which is the radiance that is displayed as the base colour.
 
@@ -48,7 +48,7 @@ def unlit(frame: Frame, scale: float = 1) -> Color:
 
 
 def upsampled_reactive(frame: Frame, scale: int) -> Mask | None:
-    """The frame's reactive mask at the output's pixels, each as the nearest sample; None without one."""
+    """Bring the frame's reactive mask to the output's pixels, each as the nearest sample; None without one."""
     if frame.reactive is None:
         return None
     return jitter_aligned_upsample(frame.reactive, scale, frame.jitter, mode="nearest")
@@ -64,7 +64,7 @@ def check_masks(earlier: Mask | None, reactive: Mask | None) -> None:
 
 
 def path_trust(earlier: Mask | None, reactive: Mask | None, motion: Motion) -> Mask | None:
-    """What reactive masks leave of a path that ``motion`` makes longer: 1 - reactive here, times what was left there.
+    """Return the trust in a path that ``motion`` makes longer: 1 - reactive here, times what was left there.
 
     Args:
       earlier: of the path from the previous frame on, ``[..., H, W, 1]``; None where frames have no masks.
@@ -106,7 +106,7 @@ def continued(frame: Frame, empty: Flag) -> Frame:
 
 
 def within_shots(method: Method) -> Method:
-    """``method``, whose shots begin with their first rendered frame.
+    """Let the shots of ``method`` begin with their first rendered frame.
 
     A frame that is not rendered and has no rendered one before it in its shot shows ``unlit``, and the frame after it
     is a cut for ``method``, which so neither trusts that picture nor remembers anything from before the shot.
@@ -143,7 +143,7 @@ def within_shots(method: Method) -> Method:
 
 
 def _parts_within_shots(method: Method, parts: Parts) -> Method:
-    """The same of a method that is made of parts."""
+    """Do the same for a method that is made of parts."""
 
     def start(example: Frame) -> Parted:
         history = method.start(example)

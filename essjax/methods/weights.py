@@ -18,9 +18,9 @@ from essjax.methods.registry import make
 from essjax.typing import PyTree
 
 FORMAT = 1
-"""Of the header; a number above this one is refused."""
+"""Format of the header; a larger number is refused."""
 KEY = "essjax"
-"""Of the header in the file's ``__metadata__``."""
+"""Name of the header in the file's ``__metadata__``."""
 
 
 def save(path: str | Path, method: Method, variables: PyTree) -> None:

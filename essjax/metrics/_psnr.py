@@ -8,7 +8,7 @@ from essjax.typing import Image, Mask, Scalar
 
 PIXEL_AXES = (-3, -2, -1)
 MAX_PSNR = 100.0
-"""What equal images score, so that means stay finite."""
+"""The score of equal images, so that means stay finite."""
 
 
 def psnr(prediction: Image, target: Image, *, mask: Mask | None = None) -> Scalar:

@@ -10,7 +10,7 @@ from essjax.warp import backward_warp
 
 
 def flicker(prediction: Image, prediction_previous: Image, target: Image, target_previous: Image) -> Image:
-    """Signed change over time that the target lacks: ``(P_t - P_{t-1}) - (T_t - T_{t-1})``, ``[..., H, W, C]``
+    """Signed change over time that the target lacks, ``[..., H, W, C]``: ``(P_t - P_{t-1}) - (T_t - T_{t-1})``.
 
     Raises:
       ValueError: the shapes of the frames differ.

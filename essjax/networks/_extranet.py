@@ -163,7 +163,7 @@ _BATCH_NORM = {"scale": "weight", "bias": "bias", "mean": "running_mean", "var":
 
 
 def torch_entries(path: tuple[str, ...]) -> list[str]:
-    """The state dict's entries that make one of our variables.
+    """Name the state dict's entries that make one of our variables.
 
     Args:
       path: its keys, for example ``("params", "conv1", "Conv_0", "kernel")``.

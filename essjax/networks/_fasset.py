@@ -63,7 +63,7 @@ class FrameEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, inputs: Image, hidden: Image, train: bool = False) -> tuple[Image, Image]:
-        """The feature map M ``[B, H, W, channels]`` and the new hidden state ``[B, H, W, width]``.
+        """Compute the feature map M ``[B, H, W, channels]`` and the new hidden state ``[B, H, W, width]``.
 
         Sizes must be multiples of 4.
         """
@@ -116,7 +116,7 @@ class Reweighting(nn.Module):
 
 
 def dense(features: int, **options) -> nn.Dense:
-    """A pixelwise layer in the networks' compute type."""
+    """Make a pixelwise layer in the networks' compute type."""
     return nn.Dense(features, dot_general=dot_general, **options)
 
 

@@ -62,7 +62,7 @@ def matched_flow(warped: Image, roughness: Plane) -> Image:
 
 
 def _halfway(image: Image) -> list[list[jax.Array]]:
-    """The padded image, borders replicated, at every half pixel: ``[k][l]`` is k / 2 down and l / 2 right of it."""
+    """Read the padded image, borders replicated, at each half pixel: ``[k][l]`` is k / 2 down and l / 2 right of it."""
     lead = [(0, 0)] * (image.ndim - 3)
     padded = jnp.pad(image, [*lead, (REACH, REACH + 1), (REACH, REACH + 1), (0, 0)], mode="edge")
     whole, down = padded[..., :-1, :, :], 0.5 * (padded[..., :-1, :, :] + padded[..., 1:, :, :])
@@ -71,7 +71,7 @@ def _halfway(image: Image) -> list[list[jax.Array]]:
 
 
 def _read(halves: list[list[jax.Array]], x: float, y: float, size: tuple[int, int]) -> jax.Array:
-    """Of ``_halfway``, every pixel at a constant offset in half pixels, ``REACH`` at most."""
+    """Take from ``_halfway`` every pixel at a constant offset in half pixels, ``REACH`` at most."""
     down, right = int(2 * (y + REACH)), int(2 * (x + REACH))
     rows, columns = slice(down // 2, down // 2 + size[0]), slice(right // 2, right // 2 + size[1])
     return halves[down % 2][right % 2][..., rows, columns, :]

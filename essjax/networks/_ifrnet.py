@@ -72,7 +72,7 @@ class Decoder(nn.Module):
 
 
 def _both(refined: Image) -> Image:
-    """The flows to the earlier and to the later image, ``[2, ..., H, W, 2]``, among a decoder's outputs."""
+    """Take the flows to the earlier and to the later image, ``[2, ..., H, W, 2]``, from a decoder's outputs."""
     return jnp.stack([refined[..., :2], refined[..., 2:4]])
 
 

@@ -77,11 +77,11 @@ class NSRR(nn.Module):
         return jnp.concatenate([rgbd, self.current_net(rgbd)], axis=-1)
 
     def previous(self, rgbd: Image, train: bool = False) -> Image:
-        """The same of a frame that later ones will look back at."""
+        """Do the same for a frame that later ones will look back at."""
         return jnp.concatenate([rgbd, self.previous_net(rgbd)], axis=-1)
 
     def reconstruct(self, current: Image, previous: Image, train: bool = False) -> tuple[Image, Image]:
-        """The output.
+        """Compute the output.
 
         Args:
           current: zero-upsampled features of the current frame, ``[B, sH, sW, FEATURES]``.

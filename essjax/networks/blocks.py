@@ -19,7 +19,7 @@ def pad_to_multiple(image: Image, multiple: int) -> Image:
 
 
 def crop(image: Image, height: int, width: int) -> Image:
-    """The top left ``height`` x ``width`` pixels: the inverse of ``pad_to_multiple``."""
+    """Keep the top left ``height`` x ``width`` pixels: the inverse of ``pad_to_multiple``."""
     return image[..., :height, :width, :]
 
 
@@ -104,7 +104,7 @@ class Conv(nn.Conv):
 
 
 def conv(features: int, size: int = 3, stride: int = 1, **options) -> Conv:
-    """A convolution, ``size`` x ``size``, zero padding, whose gradient is fast inside a scan.
+    """Make a convolution, ``size`` x ``size``, zero padding, whose gradient is fast inside a scan.
 
     With a stride, ``(size - 1) // 2`` zeros on every side, as PyTorch networks do; give ``padding`` for other ones. The
     fast gradient then needs sizes that are multiples of the stride.
@@ -211,5 +211,5 @@ class ConvBlock(nn.Module):
 
 
 def zero_conv(channels: int, size: int = 3) -> Conv:
-    """A convolution that returns zero until it is trained: residuals and flows start at their prior."""
+    """Make a convolution that returns zero until it is trained: residuals and flows start at their prior."""
     return conv(channels, size, kernel_init=nn.initializers.zeros)

@@ -46,7 +46,7 @@ _convolve.defvjp(_forward, _backward)
 
 
 def _by_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -> jax.Array:
-    """A strided convolution as a stride-1 convolution of ``stride`` x ``stride`` blocks that have become channels.
+    """Compute a strided convolution as one of stride 1 over ``stride`` x ``stride`` blocks that have become channels.
 
     The kernel gets zeros in front until it begins with a block, and behind until it ends with one.
     """
@@ -65,7 +65,7 @@ def _by_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def _strided(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -> jax.Array:
-    """The ordinary one, which is faster than blocks; only its gradient is that of ``_by_blocks``."""
+    """Compute the ordinary one, which is faster than blocks; only its gradient is that of ``_by_blocks``."""
     return lax.conv_general_dilated(x, kernel, (stride, stride), padding, dimension_numbers=_NHWC)
 
 
@@ -81,7 +81,7 @@ _strided.defvjp(_strided_forward, _strided_backward)
 
 
 def _shifted(x: jax.Array, kernel: jax.Array, padding: Padding) -> list[list[jax.Array]]:
-    """What each place of the kernel sees, ``[kh][kw]`` arrays of the output's size."""
+    """Shift the image to what each place of the kernel sees, ``[kh][kw]`` arrays of the output's size."""
     padded = jnp.pad(x, [(0, 0), *padding, (0, 0)])
     height, width = (
         n + low + high + 1 - size for n, (low, high), size in zip(x.shape[1:3], padding, kernel.shape, strict=False)

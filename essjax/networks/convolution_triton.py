@@ -130,7 +130,7 @@ def convolve(x: Array, kernel: Array, bias: Array, slope: float) -> Array:
 
 
 def reference(x: Array, kernel: Array, bias: Array, slope: float) -> Array:
-    """The same by XLA: what derivatives are taken of."""
+    """Compute the same by XLA: what derivatives are taken of."""
     y = lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
     y = y.astype(jnp.float32) + bias
     return jnp.where(y > 0, y, slope * y).astype(x.dtype)

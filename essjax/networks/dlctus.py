@@ -42,5 +42,5 @@ class DLCTUSNet(nn.Module):
 
 
 def dlctus_network() -> Network:
-    """The network of DLCTUS as a ``Network``."""
+    """Make the network of DLCTUS."""
     return from_linen(DLCTUSNet())

@@ -11,7 +11,7 @@ from essjax.typing import Array, Key, PyTree
 
 
 def kernel_bound(key: Key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
-    """The ``kernel_init`` of our layers: the bound of He's uniform distribution; ``from_linen`` multiplies by noise.
+    """Return our ``kernel_init``: the bound of He's uniform distribution; ``from_linen`` multiplies by noise.
 
     Source: He et al. 2015, eq 10, for ReLU: variance 2 / fan-in.
     """

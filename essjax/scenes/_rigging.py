@@ -12,7 +12,7 @@ from essjax.scenes.indoor import path, swing
 from essjax.scenes.materials import Material
 
 PIVOT = np.array([0.0, 0.2, 0.0])
-"""What the ship rolls about: its waterline."""
+"""The axis that the ship rolls about: its waterline."""
 
 
 class _Ship:
@@ -33,13 +33,13 @@ class _Ship:
         self.b.rod(material, radius=radius, half_length=half, **self.place(position, own))
 
     def lath(self, material: Material, start, end, radius: float) -> None:
-        """A rope of square section: there are more boxes than rods to spare."""
+        """Add a rope of square section: there are more boxes than rods to spare."""
         position, own, half = between(start, end)
         self.block(material, position, (radius, radius, half), own)
 
 
 def _mast(ship: _Ship, materials: dict[str, Material], x: float, top: float, rows: int) -> None:
-    """A mast with two yards, their lifts, and shrouds with ratlines on both sides."""
+    """Build a mast with two yards, their lifts, and shrouds with ratlines on both sides."""
     wood, tar, hemp = materials["wood"], materials["tar"], materials["hemp"]
     ship.rope(wood, (x, 0.5, 0), (x, top, 0), 0.08)
     for height, reach in ((0.55 * top, 1.5), (0.82 * top, 1.05)):
@@ -60,7 +60,7 @@ def _mast(ship: _Ship, materials: dict[str, Material], x: float, top: float, row
 
 
 def rigging(b: Builder) -> None:
-    """A rigged ship seen by a camera that circles it; it rolls slowly, as one rigid body."""
+    """Build a rigged ship seen by a camera that circles it; it rolls slowly, as one rigid body."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.bounces = 1
     zenith, horizon = (((0.3, 0.5, 0.95), (0.85, 0.93, 1.0)), ((0.75, 0.78, 0.84), (0.95, 0.95, 0.95)))[rng.integers(2)]

@@ -30,7 +30,7 @@ class Vec:
 
 
 def vec(x: Array | float, y: Array | float, z: Array | float) -> Vec:
-    """A ``Vec`` from components."""
+    """Make a ``Vec`` from components."""
     return Vec(x=jnp.asarray(x), y=jnp.asarray(y), z=jnp.asarray(z))
 
 
@@ -40,12 +40,12 @@ def dot(a: Vec, b: Vec) -> Array:
 
 
 def normalize(a: Vec) -> Vec:
-    """Unit vector; a zero vector stays (almost) zero."""
+    """Scale to unit length; a zero vector stays (almost) zero."""
     return a * jax.lax.rsqrt(dot(a, a) + 1e-20)
 
 
 def select(condition: Array, a: Vec, b: Vec) -> Vec:
-    """``a`` where ``condition``, else ``b``."""
+    """Take ``a`` where ``condition``, else ``b``."""
     return Vec(x=jnp.where(condition, a.x, b.x), y=jnp.where(condition, a.y, b.y), z=jnp.where(condition, a.z, b.z))
 
 

@@ -34,7 +34,7 @@ class Scene:
     unit: float = 1.0
 
     def at(self, index: int) -> World:
-        """The world of frame ``index``."""
+        """Return the world of frame ``index``."""
         if not 0 <= index < self.frames:
             raise ValueError(f"frame: expected 0 <= frame < {self.frames}, got {index}. Make a longer scene.")
         animated = ("to_local", "to_world", "lights", "camera_to_world", "focal")
@@ -42,7 +42,7 @@ class Scene:
         return dataclasses.replace(self.worlds, **changes)
 
     def before(self, index: int) -> World:
-        """The world one frame earlier; at a cut, the same one."""
+        """Return the world one frame earlier; at a cut, the same one."""
         return self.at(index if self.cut[index] else index - 1)
 
 
@@ -105,7 +105,7 @@ class Builder:
         self.set_sky()
 
     def new_id(self) -> int:
-        """A stencil id for an object of several primitives."""
+        """Return a new stencil id for an object of several primitives."""
         self.ids += 1
         return self.ids
 
@@ -129,33 +129,33 @@ class Builder:
         self.rows[kind].append((to_local.reshape(-1, 12), to_world.reshape(-1, 12), columns))
 
     def rect(self, material: Material, position, half_u: float, half_v: float, turn=None) -> None:
-        """A rectangle in the x, y plane of ``turn``."""
+        """Add a rectangle in the x, y plane of ``turn``."""
         self.add(RECT, material, position, (half_u, half_v, 1.0), turn)
 
     def box(self, material: Material, position, half, turn=None, object_id: int | None = None) -> None:
-        """An oriented box; seen from inside it is a room."""
+        """Add an oriented box; seen from inside it is a room."""
         self.add(BOX, material, position, half, turn, object_id)
 
     def sphere(self, material: Material, position, radius, turn=None, object_id: int | None = None) -> None:
-        """A sphere, or an ellipsoid where ``radius`` is ``[3]``."""
+        """Add a sphere, or an ellipsoid where ``radius`` is ``[3]``."""
         self.add(SPHERE, material, position, np.broadcast_to(radius, 3), turn, object_id)
 
     def rod(self, material: Material, position, radius: float, half_length: float, turn=None, object_id=None) -> None:
-        """A capped cylinder along the z axis of ``turn``."""
+        """Add a capped cylinder along the z axis of ``turn``."""
         self.add(ROD, material, position, (radius, radius, half_length), turn, object_id)
 
     def bar(self, material: Material, start, end, radius: float) -> None:
-        """A static rod from ``start`` to ``end``."""
+        """Add a static rod from ``start`` to ``end``."""
         position, turn, half_length = between(start, end)
         self.rod(material, position, radius, half_length, turn)
 
     def sun(self, direction, color) -> None:
-        """A light infinitely far away in ``direction`` ``[3]`` or ``[T, 3]``; ``color`` is its irradiance."""
+        """Add a light infinitely far away in ``direction`` ``[3]`` or ``[T, 3]``; ``color`` is its irradiance."""
         direction = np.asarray(direction, float)
         self._light(direction / np.linalg.norm(direction, axis=-1, keepdims=True), 0.0, color)
 
     def lamp(self, position, color) -> None:
-        """A point light; ``color`` is its irradiance at one metre."""
+        """Add a point light; ``color`` is its irradiance at one metre."""
         self._light(np.asarray(position, float), 1.0, color)
 
     def _light(self, place: np.ndarray, is_point: float, color) -> None:
@@ -175,7 +175,7 @@ class Builder:
         cloud_frequency=3.0,
         ambient=0.6,
     ) -> None:
-        """What rays see that hit nothing, and the ambient light that follows from it; see ``World.sky``."""
+        """Set what rays see that hit nothing, and the ambient light that follows from it; see ``World.sky``."""
         sun = np.asarray(sun_direction, float)
         sun = sun / np.linalg.norm(sun)
         parts = (zenith, horizon, ground, sun, sun_color, (sun_size, clouds, cloud_frequency, ambient))
@@ -188,7 +188,7 @@ class Builder:
         self.focal = np.broadcast_to(np.asarray(focal, float), (self.frames,))
 
     def build(self, family: str, seed: int, *, unit: float = 1.0) -> Scene:
-        """The finished scene; ``unit`` as in ``Scene``."""
+        """Return the finished scene; ``unit`` as in ``Scene``."""
         to_local, to_world = np.zeros((2, self.frames, ROWS, 12))
         to_local[..., 3::4] = 9.0  # unused rows: a degenerate transform outside every shape, which no ray hits
         materials = np.zeros((ROWS, len(COLUMNS)))

@@ -28,7 +28,7 @@ _MAKERS = {
 
 
 def make_scene(family: str, seed: int, frames: int) -> Scene:
-    """The scene of a family that belongs to ``seed``, animated over ``frames`` frames.
+    """Make the scene of a family that belongs to ``seed``, animated over ``frames`` frames.
 
     The first n frames do not depend on ``frames``.
 
@@ -46,7 +46,7 @@ def make_scene(family: str, seed: int, frames: int) -> Scene:
 
 
 def radiance_unit(family: str, seed: int) -> float:
-    """The unit of radiance of a scene, one of the powers of two over nearly four decades (1/128 to 64).
+    """Draw a scene's unit of radiance, one of the powers of two over nearly four decades (1/128 to 64).
 
     Other renderers have other units: what depends on it shows on built-in scenes, too. A power of two rounds nothing,
     so pictures and scores are those of unit 1, and half precision holds all of them.
@@ -56,7 +56,7 @@ def radiance_unit(family: str, seed: int) -> float:
 
 
 def families_of(split: str) -> tuple[str, ...]:
-    """The families of a split: ``FAMILIES`` in "test", ``TRAIN_FAMILIES`` in "train" and "validation"."""
+    """List the families of a split: ``FAMILIES`` in "test", ``TRAIN_FAMILIES`` in "train" and "validation"."""
     if split not in SPLITS:
         raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}.")
     return FAMILIES if split == "test" else TRAIN_FAMILIES

@@ -144,7 +144,7 @@ def trace(world: World, origin: Vec, direction: Vec, limit: Float[Array, "N"]) -
 
 
 def matrix_of(table: Float[Array, "P 12"], rows: Int[Array, "N"]) -> list[Array]:
-    """The 12 entries of each ray's transform, planar."""
+    """Gather the 12 entries of each ray's transform, planar."""
     planar = columns(table, rows)
     return [planar[k] for k in range(12)]
 
@@ -160,7 +160,7 @@ def to_world(world: World, rows: Int[Array, "N"], local: Vec) -> Vec:
 
 
 def local_normal(kind: Array, p: Vec, half: Vec) -> Vec:
-    """Unit outward normal, in object space (metres, unrotated), at the point ``p`` of the unit shape of ``kind``."""
+    """Return the unit outward normal, in object space (metres, unrotated), at point ``p`` of ``kind``'s unit shape."""
     ax, ay, az = jnp.abs(p.x), jnp.abs(p.y), jnp.abs(p.z)
     is_rect, is_box, is_sphere = kind == RECT, kind == BOX, kind == SPHERE
     on_x = is_box & (ax >= ay) & (ax >= az)
@@ -177,7 +177,7 @@ def local_normal(kind: Array, p: Vec, half: Vec) -> Vec:
 
 
 def rotate_to_world(m: list[Array], half: Vec, normal: Vec) -> Vec:
-    """A direction given in object space (metres, unrotated) turned into the world; ``m`` is the to-local transform."""
+    """Turn a direction given in object space (metres, unrotated) into the world; ``m`` is the to-local transform."""
     n = normal * half  # the rows of m are the object's axes divided by the half size
     return Vec(
         x=m[0] * n.x + m[4] * n.y + m[8] * n.z,

@@ -32,7 +32,7 @@ def path(x, y, z) -> np.ndarray:
 
 
 def corridor(b: Builder) -> None:
-    """A hall of pillars that the camera flies through: perspective motion and large disocclusions."""
+    """Build a hall of pillars that the camera flies through: perspective motion and large disocclusions."""
     rng, colors = b.rng, presets.palette(b.rng)
     width, height = rng.uniform(2.2, 2.8), rng.uniform(3.0, 3.6)
     b.set_sky(
@@ -72,7 +72,7 @@ def corridor(b: Builder) -> None:
 
 
 def carousel(b: Builder) -> None:
-    """A turning platform with spinning objects in front of walls full of detail."""
+    """Build a turning platform with spinning objects in front of walls full of detail."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.set_sky(ambient=0.4, clouds=0.6)
     b.rect(presets.planks(presets.shade(colors[0], 0.7)), (0, 0, 0), 12, 12, FLOOR)
@@ -126,7 +126,7 @@ def carousel(b: Builder) -> None:
 
 
 def gloss(b: Builder) -> None:
-    """A hall with a polished floor: mirror images that move against the surface they appear on."""
+    """Build a hall with a polished floor: mirror images that move against the surface they appear on."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.bounces = 1
     b.set_sky(zenith=(0.1, 0.2, 0.5), horizon=(1.3, 0.75, 0.45), clouds=0.62, ambient=0.4,

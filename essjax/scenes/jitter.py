@@ -4,7 +4,7 @@ import numpy as np
 
 
 def halton(index: int, base: int) -> float:
-    """The radical inverse of ``index`` (>= 1) in ``base``: (0, 1), evenly spread."""
+    """Compute the radical inverse of ``index`` (>= 1) in ``base``: (0, 1), evenly spread."""
     result, fraction = 0.0, 1.0
     while index > 0:
         fraction /= base
@@ -26,7 +26,7 @@ HOURGLASS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 def dlctus_pattern(scale: int) -> np.ndarray:
-    """The 16 sample positions of DLCTUS (thesis 002 section 4.2.2, figure 6), pixels in [-0.5, 0.5).
+    """Return the 16 sample positions of DLCTUS (thesis 002 section 4.2.2, figure 6), pixels in [-0.5, 0.5).
 
     At 4x4 every sample is the centre of an output pixel; at 2x2 the output pixels are visited in an hourglass, and
     each takes elements 2 to 5 of Halton (2, 3) in turn. The figure's order at 4x4 is not in the text: ours has the

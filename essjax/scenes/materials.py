@@ -72,7 +72,7 @@ class Material:
 
 @pytree
 class Surface:
-    """What a ray found, one value per ray.
+    """All that a ray found, one value per ray.
 
     Attributes:
       hit: bool.
@@ -136,7 +136,7 @@ def _texture_plane(kind: Array, p: Vec, normal: Vec, half: Vec) -> tuple[Array, 
 def surface(
     world: World, rows: Int[Array, "N"], origin: Vec, direction: Vec, t: Float[Array, "N"], footprint: Float[Array, "N"]
 ) -> Surface:
-    """The surface at distance ``t`` along each ray.
+    """Look up the surface at distance ``t`` along each ray.
 
     Args:
       world: the scene now.

@@ -47,7 +47,7 @@ def grille(b: Builder) -> None:
 
 
 def shadows(b: Builder) -> None:
-    """A courtyard under a racing sun and a flying lamp: hard shadows that sweep over static geometry."""
+    """Build a courtyard under a racing sun and a flying lamp: hard shadows that sweep over static geometry."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.set_sky(zenith=(0.2, 0.3, 0.6), horizon=(0.9, 0.75, 0.6), ambient=0.35, clouds=0.6)
     b.rect(
@@ -118,7 +118,7 @@ def texture(b: Builder) -> None:
 
 
 def _square(b: Builder, colors) -> None:
-    """What plaza and cuts share: a paved square with houses, signs, lamps, a fence and moving things."""
+    """Build what plaza and cuts share: a paved square with houses, signs, lamps, a fence and moving things."""
     rng = b.rng
     b.rect(presets.tiles(presets.shade(colors[0], 0.85), (0.2, 0.18, 0.17), frequency=0.8), (0, 0, 0), 30, 30, FLOOR)
     for k in range(9):
@@ -165,7 +165,7 @@ def _square(b: Builder, colors) -> None:
 
 
 def plaza(b: Builder) -> None:
-    """A square in the evening sun: glowing signs, lamps, metal, a pool that mirrors the sky, all far above white."""
+    """Build a square in the evening sun: glowing signs, lamps, metal, a pool that mirrors the sky, far above white."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.bounces = 1
     sun = (rng.uniform(-0.4, 0.4), 0.32, -1.0)
@@ -187,7 +187,7 @@ def plaza(b: Builder) -> None:
 
 
 def cuts(b: Builder) -> None:
-    """The same kind of square at noon, seen by four cameras in turn: history ends at every cut."""
+    """Build the same kind of square at noon, seen by four cameras in turn: history ends at every cut."""
     rng, colors = b.rng, presets.palette(b.rng)
     b.set_sky(clouds=0.68, ambient=0.6, sun_direction=(0.5, 0.7, 0.4), sun_color=(60, 56, 48))
     _square(b, colors)

@@ -23,7 +23,7 @@ def palette(rng: np.random.Generator) -> list[Rgb]:
 
 
 def shade(color: Rgb, factor: float) -> Rgb:
-    """A darker (or, up to 1, brighter) colour."""
+    """Make a darker (or, up to 1, brighter) colour."""
     r, g, b = (min(1.0, c * factor) for c in color)
     return (r, g, b)
 
@@ -53,7 +53,7 @@ def planks(color: Rgb, *, frequency: float = 0.6) -> Material:
 
 
 def plaster(color: Rgb, *, grime: float = 0.25) -> Material:
-    """A painted wall."""
+    """Make a painted wall."""
     return Material(a=color, grime=grime, grime_frequency=3.0, bump=0.12, roughness=0.9)
 
 
@@ -63,7 +63,7 @@ def stone(color: Rgb, other: Rgb) -> Material:
 
 
 def checker(a: Rgb, b: Rgb, *, frequency: float = 2.0, roughness: float = 0.45, mirror: float = 0.0) -> Material:
-    """A chess board."""
+    """Make a chess board."""
     return Material(
         a=a, b=b, pattern=textures.CHECKER, frequency=frequency, grime=0.12, grime_frequency=6.0, roughness=roughness,
         mirror=mirror,
@@ -84,7 +84,7 @@ def screen(color: Rgb, *, frequency: float = 3.0, strength: float = 8.0) -> Mate
 
 
 def lamp(color: Rgb, strength: float = 12.0) -> Material:
-    """A light source that can be looked at."""
+    """Make a light source that can be looked at."""
     return Material(a=color, grime=0.0, emission=strength)
 
 
@@ -109,7 +109,7 @@ def paint(color: Rgb, *, roughness: float = 0.3) -> Material:
 
 
 def decorated(rng: np.random.Generator, a: Rgb, b: Rgb, *, detail: float = 1.0) -> Material:
-    """A random patterned material for an object; ``detail`` scales its frequencies."""
+    """Make a random patterned material for an object; ``detail`` scales its frequencies."""
     makers = (
         lambda: checker(a, b, frequency=3.0 * detail),
         lambda: stripes(a, b, frequency=4.0 * detail),

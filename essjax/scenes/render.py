@@ -143,7 +143,7 @@ def buffers(
 
 @jax.jit
 def surfaces(world: World, previous: World, x: Array, y: Array, angle: Array) -> dict[str, Float[Array, "N C"]]:
-    """Of every sample: normal with and without bump detail (0 where nothing is hit), depth, motion in image widths."""
+    """Find each sample's normal with and without bumps (0 where nothing is hit), its depth, motion in image widths."""
     origin, direction, cosine = primary_rays(world, x, y)
     t, row = geometry.trace(world, origin, direction, jnp.full_like(x, geometry.FAR))
     s = surface(world, row, origin, direction, t, t * angle)
@@ -177,7 +177,7 @@ def _threads() -> ThreadPoolExecutor:
 
 @functools.lru_cache(8)
 def tile_order(width: int, height: int, tile: int) -> np.ndarray:
-    """Indices of all pixels, tile by tile: rays that are traced together should lie together. Shared: do not write."""
+    """List all pixels tile by tile: rays that are traced together should lie together. Shared: do not write."""
     y, x = np.divmod(np.arange(width * height), width)
     return np.lexsort((x, y, x // tile, y // tile))
 

@@ -44,7 +44,7 @@ def sky(world: World, direction: Vec, width: Array, run: Array) -> Vec:
 
 
 def ambient(world: World, direction: Vec) -> Vec:
-    """The sky, blurred: light from around ``direction`` (unit)."""
+    """Blur the sky: light from around ``direction`` (unit)."""
     above = (_constant(world.sky, 0) + _constant(world.sky, 3)) * 0.5
     return mix(_constant(world.sky, 6), above, saturate(0.5 + 0.5 * direction.y)) * world.sky[18]
 

@@ -17,7 +17,7 @@ GLYPH_COLUMNS = 7
 
 
 def hash_cell(x: Array, y: Array, seed: Array) -> Array:
-    """A pseudo-random uint32 for the integer cell (x, y) given as floats."""
+    """Hash the integer cell (x, y), given as floats, to a pseudo-random uint32."""
     ix, iy, iz = (v.astype(jnp.int32).astype(jnp.uint32) for v in (x, y, seed))
     h = ix * jnp.uint32(0x27D4EB2D) ^ iy * jnp.uint32(0x165667B1) ^ iz * jnp.uint32(0x9E3779B1)
     h = (h ^ (h >> 15)) * jnp.uint32(0x85EBCA6B)
@@ -133,5 +133,5 @@ def evaluate(
 
 
 def contrast(value: Array, amount: Array) -> Array:
-    """A factor around 1: ``1 + amount * (2 * value - 1)``, at least 0."""
+    """Return a factor around 1: ``1 + amount * (2 * value - 1)``, at least 0."""
     return larger(1.0 + amount * (2.0 * value - 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""What the renderer reads: one instant of a scene as arrays, and the layout of its tables.
+"""The renderer's input: one instant of a scene as arrays, and the layout of its tables.
 
 Every primitive is a unit shape under an affine transform: the square z = 0, the cube, the sphere and the capped
 cylinder along z, all inside [-1, 1]^3. A table row holds one primitive. The four kinds occupy fixed

@@ -41,7 +41,7 @@ class Checkpoints:
         self._manager.wait_until_finished()
 
     def restore(self, like: PyTree) -> tuple[PyTree, dict[str, Any]]:
-        """The newest checkpoint, with the structure, shapes and types of ``like``.
+        """Restore the newest checkpoint, with the structure, shapes and types of ``like``.
 
         Raises:
           ValueError: there is none, or it was written for other shapes (another width, say).

@@ -164,20 +164,20 @@ def train(
 def restore_stage(
     checkpoints: Checkpoints, state: TrainState, trained: str
 ) -> tuple[TrainState, PyTree, dict[str, Any]]:
-    """The newest checkpoint of a stage that starts with ``state``: its state, the best entry so far, its progress."""
+    """Restore the newest checkpoint of a stage that starts with ``state``: its state, best entry so far, progress."""
     found, saved = checkpoints.restore({"state": state, "best": state.variables[trained]})
     return found["state"], found["best"], saved
 
 
 def chosen_variables(state: TrainState, best: PyTree, trained: str, progress: dict[str, Any]) -> PyTree:
-    """The variables that a stage ends with: the best of its validations, without any the last (averaged) ones."""
+    """Choose what a stage ends with: the best of its validations, without any the last (averaged) variables."""
     if len(progress.get("validated", ())) > 1:  # not the start alone
         return {**state.variables, trained: jax.tree.map(jnp.asarray, best)}
     return averaged(state, trained)
 
 
 def mean_score(scores: dict[str, float]) -> float:
-    """Of one validation: mean PSNR over kinds, minus infinity where it is not finite."""
+    """Average the PSNR of one validation over kinds; minus infinity where it is not finite."""
     value = float(np.mean([value for name, value in scores.items() if name != "step"]))
     return value if np.isfinite(value) else -np.inf
 
@@ -188,7 +188,7 @@ def best_validation(validated: list[dict[str, float]]) -> int:
 
 
 def read_progress(saved: dict[str, Any]) -> dict[str, Any]:
-    """What a checkpoint's progress says of the stage so far, see ``train``; nothing where it is absent."""
+    """Read what a checkpoint's progress says of the stage so far, see ``train``; nothing where it is absent."""
     nothing = {"seconds": 0.0, "compile_seconds": 0.0, "validation_seconds": 0.0, "still": 0, "validated": []}
     return {name: saved.get(name, value) for name, value in nothing.items()}
 

@@ -1,4 +1,4 @@
-"""What a training stage carries from step to step."""
+"""The state that a training stage carries from step to step."""
 
 import math
 
@@ -77,7 +77,7 @@ def create_state(
     history: PyTree = None,
     average: bool = False,
 ) -> TrainState:
-    """A state at step 0 that trains ``variables[trained]``; with ``history`` (``Recurrent.start``) on successive clips.
+    """Make a state at step 0 that trains ``variables[trained]``; ``history`` (``Recurrent.start``): successive clips.
 
     With ``average`` the weights are averaged over the steps, see ``averaged``.
 
@@ -94,7 +94,7 @@ def create_state(
 
 
 def averaged(state: TrainState, trained: str) -> PyTree:
-    """The variables with the moving average of the trained weights in place of the last ones, if there is one."""
+    """Put the moving average of the trained weights, if there is one, in place of the last ones."""
     if state.average is None:
         return state.variables
     weights, statistics = split_statistics(state.variables[trained])
@@ -102,7 +102,7 @@ def averaged(state: TrainState, trained: str) -> PyTree:
 
 
 def update_average(average: Array, weights: PyTree, step: Array, decay: float) -> Array:
-    """The moving average after one more step: over about 1 / (1 - decay) steps, over a tenth of them at first.
+    """Move the average by one more step: over about 1 / (1 - decay) steps, over a tenth of them at first.
 
     Args:
       average: before the step, one vector.
@@ -115,7 +115,7 @@ def update_average(average: Array, weights: PyTree, step: Array, decay: float) -
 
 
 def split_statistics(entry: PyTree) -> tuple[PyTree, PyTree]:
-    """An entry of the variables as what gradients change and its BatchNorm statistics ({} if it has none)."""
+    """Split an entry of the variables into what gradients change and its BatchNorm statistics ({} if it has none)."""
     weights = {name: part for name, part in entry.items() if name != STATISTICS}
     return weights, {name: part for name, part in entry.items() if name == STATISTICS}
 

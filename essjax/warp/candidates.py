@@ -14,6 +14,6 @@ FAR = 1e6  # pixels; keeps integers from overflowing
 
 
 def candidate_offsets() -> np.ndarray:
-    """The 33 offsets ``[33, 2]`` (x, y) of eq 1 in the order that breaks ties: centre, then by stride, row, column."""
+    """List the 33 offsets ``[33, 2]`` (x, y) of eq 1 in the order that breaks ties: centre, stride, row, column."""
     ring = [(s * k, s * l) for s in STRIDES for l in (-1, 0, 1) for k in (-1, 0, 1) if (k, l) != (0, 0)]  # noqa: E741
     return np.array([(0, 0), *ring], np.int32)

@@ -10,7 +10,7 @@ _SMALL = 1e-6
 
 
 def _block_sums(image: Array) -> Array:
-    """Sums over blocks of 2x2; odd sizes are padded with zeros."""
+    """Sum over blocks of 2x2; odd sizes are padded with zeros."""
     height, width, channels = image.shape[-3:]
     padded = jnp.pad(image, [(0, 0)] * (image.ndim - 3) + [(0, height % 2), (0, width % 2), (0, 0)])
     folded = space_to_depth(padded, 2)

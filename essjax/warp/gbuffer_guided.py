@@ -34,12 +34,12 @@ IMPLEMENTATIONS = ("auto", *SELECTIONS, "triton")
 
 
 def guides(gbuffers: GBuffers) -> Image:
-    """The guide of eq 2: base colour and normal, ``[..., H, W, 6]``."""
+    """Make the guide of eq 2: base colour and normal, ``[..., H, W, 6]``."""
     return jnp.concatenate(surface_guides(gbuffers), axis=-1)
 
 
 def _smaller(a: Array, b: Array) -> Array:
-    """The minimum of numbers that are not NaN: one instruction, where ``jnp.minimum`` takes care of NaN."""
+    """Take the minimum of numbers that are not NaN: one instruction, where ``jnp.minimum`` takes care of NaN."""
     return jnp.where(a < b, a, b)
 
 
@@ -69,7 +69,7 @@ def _scaled(image: Array, scale: Array, instead: float) -> list[Array]:
 
 
 def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> list[Array]:
-    """The key of each of the 33 candidates, ``[H, W]``: the bits of its cost, the low 6 its number, read as a float."""
+    """Make a key per candidate, 33 times ``[H, W]``: the bits of its cost, the low 6 its number, read as a float."""
     height, width, channels = guide.shape
     # Costs are sums of squares of scaled differences. The border is so far from every guide that a candidate there is
     # never usable, without any comparison of positions; so is what is not finite. One plane per channel, as gathers of
@@ -98,7 +98,7 @@ def _keys(guide_previous: Array, guide: Array, motion: Array, inverse: Array) ->
 
 
 def _best_by_network(keys: list[Array]) -> list[Array]:
-    """The four smallest, in order: fours are sorted and merged, dropping the larger half."""
+    """Find the four smallest, in order: fours are sorted and merged, dropping the larger half."""
     best, rest = keys[:WINNERS], keys[WINNERS:]
     best = _sort_pairs(best, *_SORT_FOUR)
     while rest:
@@ -125,7 +125,7 @@ def _pack(best: list[Array]) -> Array:
 
 
 def _winner(packed: Array, rank: Array | int, motion: Array) -> tuple[Array, Array, Array]:
-    """Of the winner of a rank: whether it can be used, its column and its row."""
+    """Tell of the winner of a rank whether it can be used, its column and its row."""
     number = (packed >> (6 * rank)) & _ID_MASK
     usable = number < _ID_MASK
     # Where nothing is usable this is the centre clamped to the image: the nearest border pixel.
@@ -140,7 +140,7 @@ def _winner(packed: Array, rank: Array | int, motion: Array) -> tuple[Array, Arr
 
 @jax.custom_batching.sequential_vmap
 def _select_alone(guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> Array:
-    """The network as a program of its own, for XLA:CPU.
+    """Run the network as a program of its own, for XLA:CPU.
 
     Fused with what reads its result it falls apart into gathers that are written out (20 times slower; jax 0.10 removes
     barriers too early to prevent that). A branch is a border that nothing is fused across. Its condition may not be
@@ -156,7 +156,7 @@ def _select_some(*arrays: Array) -> Array:
 
 
 def _select_nothing(*arrays: Array) -> Array:
-    """The constant for no winner, plus a zero that varies where the arrays do, as shard_map wants of both branches."""
+    """Return the constant for no winner, plus a zero that varies like the arrays, as shard_map wants of branches."""
     zero = sum(jnp.max(array).astype(jnp.int32) for array in arrays) * 0
     return _pack([jnp.full(arrays[2].shape[:2], jnp.inf, jnp.float32)] * WINNERS) + zero
 
@@ -198,7 +198,7 @@ def _weigh(
 
 
 def _blend(packed: Array, radiance: Array, *arrays: Array) -> Array:
-    """The image from packed winners and all that gradients pass through."""
+    """Blend the image from packed winners and all that gradients pass through."""
     weights, pixels = _weigh(packed, *arrays)
     flat = radiance.reshape(-1, radiance.shape[-1])
     values = [gather_pixels(flat, pixel).astype(jnp.float32) for pixel in pixels]
@@ -208,7 +208,7 @@ def _blend(packed: Array, radiance: Array, *arrays: Array) -> Array:
 
 @jax.custom_jvp
 def _kernel(radiance: Array, guide_previous: Array, guide: Array, motion: Array, inverse: Array) -> tuple[Array, Array]:
-    """The Triton kernel on one image: the warped image, and which candidates won (as ``_select``)."""
+    """Run the Triton kernel on one image: the warped image, and which candidates won (as ``_select``)."""
     from essjax.warp.gbuffer_guided_triton import guided  # an optional package
 
     scale = jnp.sqrt(0.5 * inverse)
@@ -228,7 +228,7 @@ def _derivative(primals, tangents):
 
 
 def _chosen(implementation: str, known: tuple[str, ...] = IMPLEMENTATIONS) -> str:
-    """The implementation that is used.
+    """Choose the implementation that is used.
 
     Raises:
       ValueError: not one of ``known``, or it cannot run here.
@@ -324,7 +324,7 @@ def guided_weights(
     sigma_distance: float | Array = SIGMA_DISTANCE,
     implementation: str = "network",
 ) -> tuple[Array, Array]:
-    """What ``gbuffer_guided_warp`` blends: to look at, and to warp several images alike.
+    """Return what ``gbuffer_guided_warp`` blends: to look at, and to warp several images alike.
 
     Returns:
       Weights ``[..., H, W, 4]``, sum 1, best first, and pixel numbers ``[..., H, W, 4]`` (row * W + column) in the

@@ -39,7 +39,7 @@ def _sort_four(a, b, c, d):
 
 @triton.jit
 def _merge_fours(a, b, c, d, e, f, g, h):
-    """The four smallest, sorted, of two sorted fours."""
+    """Merge two sorted fours: the four smallest, sorted."""
     a, b, c, d = tl.minimum(a, h), tl.minimum(b, g), tl.minimum(c, f), tl.minimum(d, e)
     a, c = _exchange(a, c)
     b, d = _exchange(b, d)
@@ -203,7 +203,7 @@ def guided_kernel(
 
 
 def constants(radiance: Any, guide: Any, shared: tuple[bool, ...]) -> dict[str, Any]:
-    """What the kernel knows when it is compiled.
+    """Collect what the kernel knows when it is compiled.
 
     Args:
       radiance: ``[B or 1, H, W, C]``.
@@ -225,7 +225,7 @@ def grid(height: int, width: int, batch: int) -> tuple[int, int, int]:
 
 @kernels.over_batches
 def guided(radiance: Array, planes: Array, guide: Array, motion: Array, scale: Array) -> list[Array]:
-    """The kernel: arguments and results of ``guided_kernel`` as arrays; leading axes are B, or 1 for all of a batch."""
+    """Call ``guided_kernel``: its arguments and results as arrays; leading axes are B, or 1 for all of a batch."""
     arrays = radiance, planes, guide, motion, scale
     batch = max(array.shape[0] for array in arrays)
     height, width, depth = radiance.shape[1:]

@@ -12,7 +12,7 @@ from essjax.warp.upsample import check_jitter, jitter_aligned_upsample
 
 
 def jittered_motion(motion: Motion, jitter: Jitter, jitter_previous: Jitter) -> Motion:
-    """What a warp between two jittered frames looks up: ``motion + (jitter - jitter_previous)`` (SPEC 0).
+    """Point to where a warp between jittered frames reads: ``motion + (jitter - jitter_previous)`` (SPEC 0).
 
     Pixel x of frame t was sampled at x + j_t; that point was at x + j_t + motion in frame t-1, whose pixels were
     sampled at their centres + j_{t-1}. Only for low-resolution frames: references and HR history are unjittered.
@@ -91,7 +91,7 @@ def upsample_motion(motion: Motion, scale: float, *, jitter: Jitter | None = Non
 
 
 def _shifted(image: Array, dy: int, dx: int, radius: int, height: int, width: int) -> Array:
-    """The window of an image padded by ``radius`` whose pixel (y, x) is the original's (y + dy, x + dx)."""
+    """Cut out the window of an image padded by ``radius`` whose pixel (y, x) is the original's (y + dy, x + dx)."""
     return image[..., radius + dy : radius + dy + height, radius + dx : radius + dx + width, :]
 
 
@@ -127,7 +127,7 @@ def dilate_motion(motion: Motion, depth: Plane, *, radius: int = 1) -> Motion:
 
 
 def splat_motion(values: Image, depth: Plane, motion: Motion) -> tuple[Image, Plane, Mask]:
-    """What pixels carry, seen from where their motion leads: ``splat_nearest``, its cracks filled.
+    """Carry pixels to where their motion leads: ``splat_nearest``, its cracks filled.
 
     A crack (a pixel that nothing was written to, next to one that was) takes the values of the nearest surface around.
 

@@ -55,7 +55,7 @@ def _agreement(a: Array | None, b: Array | None) -> Array:
 def _same_surface(
     current: GBuffers, previous: GBuffers, normal_threshold, position_threshold, depth_threshold, stencil_threshold
 ) -> Array:
-    """The three conditions (ExtraNet eq 8-10) between pixels that are already aligned; bool ``[..., H, W, 1]``."""
+    """Test the three conditions (ExtraNet eq 8-10) between aligned pixels; bool ``[..., H, W, 1]``."""
     sky, sky_previous = ~jnp.isfinite(current.depth), ~jnp.isfinite(previous.depth)
     depth = jnp.where(sky, 1.0, current.depth)
     depth_previous = jnp.where(sky_previous, 1.0, previous.depth)

@@ -33,7 +33,7 @@ class Resampled(NamedTuple):
 
 
 def _nearest_three(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Array]:
-    """Indices ``[3, scale * size]`` of the LR samples next to each output pixel on one axis, the nearest first.
+    """Find the LR samples next to each output pixel on one axis, ``[3, scale * size]`` indices, the nearest first.
 
     Returns:
       The indices, which may lie one outside; the distance to them in output pixels; whether they are inside.
@@ -46,14 +46,14 @@ def _nearest_three(size: int, scale: int, jitter: Array) -> tuple[Array, Array, 
 
 
 def _gaussian_axis(size: int, scale: int, jitter: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """Indices, normalised weights, and the logarithm of the largest weight before normalisation."""
+    """Return indices, normalised weights, and the logarithm of the largest weight before normalisation."""
     index, distance, inside = _nearest_three(size, scale, jitter)
     log_weight = jnp.where(inside, -0.5 * (distance / sigma) ** 2, -jnp.inf)
     return index, jax.nn.softmax(log_weight, axis=0), log_weight[0]
 
 
 def _tent_axis(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Array]:
-    """Indices and normalised weights (0 where no sample is within a pixel); no logarithm is needed."""
+    """Return indices and normalised weights (0 where no sample is within a pixel); no logarithm is needed."""
     index, distance, inside = _nearest_three(size, scale, jitter)
     weight = jnp.where(inside, jnp.maximum(1.0 - jnp.abs(distance), 0.0), 0.0)
     total = weight.sum(axis=0)

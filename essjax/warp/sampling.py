@@ -47,7 +47,7 @@ def cubic_weights(t: Array, a: float) -> list[Array]:
 
 
 def axis_taps(positions: Array, size: int, mode: str, outside: str) -> list[Tap]:
-    """The taps that interpolate at ``positions`` (pixels, centres at +0.5) along an axis of ``size`` pixels."""
+    """Return the taps that interpolate at ``positions`` (pixels, centres at +0.5) along an axis of ``size`` pixels."""
     half = {"nearest": 0, "bilinear": 1}.get(mode, 2)
     # Far outside nothing changes any more; the clamp keeps the integers below from overflowing.
     positions = jnp.clip(positions.astype(jnp.float32), -3.0, size + 3.0)
@@ -122,7 +122,7 @@ def _sample_taps(image: Array, positions: Array, mode: str, outside: str) -> Arr
 
 
 def _sample_windows(image: Array, positions: Array, mode: str, outside: str) -> Array:
-    """The same by one gather of a 4x4 window per position: slower itself, but its transpose is a single scatter."""
+    """Do the same by one gather of a 4x4 window per position: slower itself, but its transpose is a single scatter."""
     height, width, channels = image.shape[-3:]
     margin = 5  # positions are clamped to 3 pixels outside: every window lies in the padded image
     pad = [(0, 0)] * (image.ndim - 3) + [(margin, margin), (margin, margin), (0, 0)]

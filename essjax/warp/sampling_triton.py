@@ -27,7 +27,7 @@ def _outer(d, a: tl.constexpr):
 
 @triton.jit
 def _taps(position, size: tl.constexpr, step: tl.constexpr, a: tl.constexpr, zeros: tl.constexpr):
-    """Indices, times ``step``, and weights of the four pixels along one axis."""
+    """Return indices, times ``step``, and weights of the four pixels along one axis."""
     # A position that is not a number reads what is not a number, as XLA does.
     x = tl.maximum(position, -3.0, propagate_nan=tl.PropagateNan.ALL)
     x = tl.minimum(x, size + 3.0, propagate_nan=tl.PropagateNan.ALL) - 0.5

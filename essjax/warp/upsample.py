@@ -13,14 +13,14 @@ from essjax.warp.sampling import Tap, axis_taps, check_mode, gather_pixels, samp
 
 
 def check_scale(scale: int, name: str = "scale") -> int:
-    """The scale as an int; raise a ValueError unless it is a whole number >= 1."""
+    """Return the scale as an int; raise a ValueError unless it is a whole number >= 1."""
     if int(scale) != scale or scale < 1:
         raise ValueError(f"{name}: expected a whole number >= 1, got {scale!r}.")
     return int(scale)
 
 
 def check_jitter(jitter: Jitter | Sequence[float]) -> Array:
-    """The jitter as a float32 array; raise a ValueError unless it is ``[..., 2]``."""
+    """Return the jitter as a float32 array; raise a ValueError unless it is ``[..., 2]``."""
     jitter = jnp.asarray(jitter, jnp.float32)
     if jitter.shape[-1:] != (2,):
         raise ValueError(f"jitter: expected [..., 2] (x, y) in LR pixels, got {jitter.shape}.")

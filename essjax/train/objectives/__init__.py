@@ -1,4 +1,4 @@
-"""What each stage minimises: ``Objective = (variables, clip) -> ({term: weighted scalar}, statistics)``."""
+"""Objectives, one per training stage: ``(variables, clip) -> ({term: weighted scalar}, statistics)``."""
 
 from essjax.train.objectives.classifier import classification_objective, composition_objective
 from essjax.train.objectives.common import Objective, Recurrent, both_kinds, odd_length, predict_last, since_cut

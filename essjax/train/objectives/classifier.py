@@ -1,4 +1,4 @@
-"""What classifier-guided supersampling minimises: first the classifier, on automatic labels, then the blending."""
+"""Objectives of classifier-guided supersampling: first the classifier, on automatic labels, then the blending."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from essjax.typing import Array, PyTree
 
 
 def required_ranges(clip: Sequence) -> SampleRanges:
-    """The clip's sample ranges; a ValueError that says how to get them."""
+    """Return the clip's sample ranges; a ValueError says how to get them."""
     if clip.ranges is None:
         raise ValueError(
             "classifier: its labels are made of the ranges over all samples of each reference pixel, which this data "

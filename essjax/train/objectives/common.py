@@ -1,4 +1,4 @@
-"""What objectives are, and the rollouts behind them: every frame as both kinds, or the last frame alone."""
+"""The type of objectives, and the rollouts of which they are made: every frame as both kinds, or the last alone."""
 
 import dataclasses
 from functools import partial
@@ -61,13 +61,13 @@ class Recurrent:
     follow: Callable[[PyTree, Sequence, PyTree], tuple[dict[str, Array], PyTree, PyTree]]
 
     def __call__(self, variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
-        """The terms of a clip that nothing precedes, and the new statistics."""
+        """Return the terms of a clip that nothing precedes, and the new statistics."""
         clip = _begun(odd_length(clip))
         return self.follow(variables, clip, self.start(clip))[:2]
 
 
 class BothKinds(NamedTuple):
-    """What a clip gave, unrolled twice.
+    """The results of a clip, unrolled twice.
 
     Attributes:
       kinds: kind -> what was kept of frames 1 ... T-2, time-major.
@@ -90,7 +90,7 @@ def _two_runs(frames: Frame) -> Frame:
 
 
 def start_both_kinds(method: Method, clip: Sequence) -> PyTree:
-    """The history that ``follow_both_kinds`` needs for a clip whose frame 0 is a cut."""
+    """Make the history that ``follow_both_kinds`` needs for a clip whose frame 0 is a cut."""
     return method.start(select_time(_two_runs(clip.frames), 0))
 
 
@@ -143,7 +143,7 @@ def odd_length(clip: Sequence) -> Sequence:
 
 
 def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Schedule | None = None) -> Prediction:
-    """What the step of the last frame of a clip returns (``train=True``), from the history that the schedule gives it.
+    """Predict the last frame of a clip (``train=True``), from the history that the schedule gives it.
 
     For losses on that frame alone. Of the steps before it only what the history needs is computed and differentiated.
 
@@ -169,7 +169,7 @@ def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Sch
 
 
 def _unseen(method: Method) -> Method:
-    """``method`` without images: a rollout of it computes what the history needs, and nothing else."""
+    """Take the images from ``method``: a rollout of it computes what the history needs, and nothing else."""
 
     def silent(step: Step) -> Step:
         def run(variables, history, frame, *, train=False):

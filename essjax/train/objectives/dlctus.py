@@ -1,4 +1,4 @@
-"""What DLCTUS minimises: the last frames of a clip, with backpropagation through all of it (thesis 002 section 4.3)."""
+"""Objective of DLCTUS: the last frames of a clip, with backpropagation through all of it (thesis 002 section 4.3)."""
 
 import jax.numpy as jnp
 

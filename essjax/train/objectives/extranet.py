@@ -1,4 +1,4 @@
-"""What ExtraNet's training minimises (section 4.5).
+"""Objective of ExtraNet (section 4.5).
 
 Our reading, that of the published code: the losses compare the network's output with the demodulated frame, both
 log(1 + x), before base colour comes back. The frame is the jittered, aliased one.

@@ -1,4 +1,4 @@
-"""What FASSET's training minimises (section 3.4): every inner frame of a clip as SS and as ESS, see ``both_kinds``."""
+"""Objective of FASSET (section 3.4): every inner frame of a clip as SS and as ESS, see ``both_kinds``."""
 
 from essjax.color import expose, log1p
 from essjax.frames import Sequence

@@ -1,4 +1,4 @@
-"""What IFRNet minimises (Kong et al. 2022): reconstruction and feature space geometry, on log(1 + x)."""
+"""Objective of IFRNet (Kong et al. 2022): reconstruction and feature space geometry, on log(1 + x)."""
 
 import jax
 

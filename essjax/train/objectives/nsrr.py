@@ -1,4 +1,4 @@
-"""What NSRR minimises (Xiao et al. 2020): structural dissimilarity and a perceptual distance."""
+"""Objective of NSRR (Xiao et al. 2020): structural dissimilarity and a perceptual distance."""
 
 import jax.numpy as jnp
 
