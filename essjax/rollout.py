@@ -202,7 +202,7 @@ def _collect(outputs: list[tuple], kinds: tuple[str, ...]) -> Collected:
 
 
 def _join(parts: list[Collected]) -> Collected:
-    """Parts behind each other; not all have frames of every kind."""
+    """Join parts that follow each other; not all have frames of every kind."""
     return {
         what: {
             name: jax.tree.map(

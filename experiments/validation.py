@@ -20,7 +20,7 @@ SPLIT = "validation"
 CLIPS = 8
 """At most; of more, some that are equally far apart."""
 SCORED = 4
-"""Frames of each clip that are scored, behind those that warm up: as many rendered as extrapolated ones."""
+"""Frames of each clip that are scored, after those that warm up: as many rendered as extrapolated ones."""
 
 
 class Window(NamedTuple):

@@ -60,7 +60,7 @@ class Rounds:
         return {"round": self._round, "taken": self._taken, "inner": inner}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Continue behind a saved state: its round is made again."""
+        """Continue after a saved state: its round is made again."""
         self._next, self._current = None, None
         self._round, self._taken = state["round"], state["taken"]
         if state["inner"] is not None:

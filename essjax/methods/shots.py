@@ -16,7 +16,7 @@ from essjax.warp import backward_warp, jitter_aligned_upsample
 
 @pytree
 class Shot:
-    """The history of a method behind ``within_shots``.
+    """The history of a method inside ``within_shots``.
 
     Attributes:
       inner: the method's own.

@@ -149,7 +149,7 @@ class GatedConv(nn.Module):
       width: output channels.
       size: of the kernel.
       stride: see ``conv``.
-      norm: BatchNorm and ReLU behind the gate.
+      norm: BatchNorm and ReLU after the gate.
     """
 
     width: int

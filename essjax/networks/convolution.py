@@ -17,7 +17,7 @@ from essjax.networks.precision import LIKED, current_itemsize, in_compute_dtype,
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
 Padding = tuple[tuple[int, int], ...]
-"""(before, behind) of rows and of columns."""
+"""(before, after) of rows and of columns."""
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -48,7 +48,7 @@ _convolve.defvjp(_forward, _backward)
 def _by_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: Padding) -> jax.Array:
     """Compute a strided convolution as one of stride 1 over ``stride`` x ``stride`` blocks that have become channels.
 
-    The kernel gets zeros in front until it begins with a block, and behind until it ends with one.
+    The kernel gets zeros in front until it begins with a block, and at the end until it ends with one.
     """
     batch, height, width, channels = x.shape
     front = [-low % stride for low, _ in padding]

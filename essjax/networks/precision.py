@@ -69,7 +69,7 @@ LIKED = 8
 
 
 def pad_channels(x: jax.Array) -> jax.Array:
-    """16-bit images with zeros behind their channels up to a multiple of ``LIKED``; others unchanged.
+    """Pad 16-bit images with channels of zeros up to a multiple of ``LIKED``; others unchanged.
 
     cuDNN pads by passes of its own; written out, XLA joins it with what makes the image.
     """

@@ -32,7 +32,7 @@ class Validation(NamedTuple):
 
     Attributes:
       score: variables -> kind of frame -> PSNR, dB; the mean over kinds counts.
-      times: how often behind the start, equally apart in the budget; the last time is at its end.
+      times: how often after the start, equally apart in the budget; the last time is at its end.
     """
 
     score: Callable[[PyTree], dict[str, float]]
@@ -183,7 +183,7 @@ def mean_score(scores: dict[str, float]) -> float:
 
 
 def best_validation(validated: list[dict[str, float]]) -> int:
-    """Index of the best ``mean_score`` behind the start; of equally good ones the last."""
+    """Index of the best ``mean_score`` after the start; of equally good ones the last."""
     return max(range(len(validated)), key=lambda n: (n > 0, mean_score(validated[n]), n))
 
 

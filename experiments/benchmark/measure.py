@@ -17,7 +17,7 @@ from experiments.trace import device_milliseconds
 REPETITIONS = 20
 WARM_UP = 2
 QUEUED = {"gpu": 10}
-"""Backend -> calls per repetition, one behind the other before the clock stops. A single short call on a GPU measures
+"""Backend -> calls per repetition, one after the other before the clock stops. A single short call on a GPU measures
 its launch and the wait for it; in a renderer there is always more in the queue."""
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 _LOWERING_EVENTS = ("/jax/core/compile/jaxpr_trace_duration", "/jax/core/compile/jaxpr_to_mlir_module_duration")

@@ -16,7 +16,7 @@ NOTES = {
 }
 
 GPU_NOTE = (
-    f"{QUEUED['gpu']} calls one behind the other before each look at the clock (pipeline: one frame); device: for how "
+    f"{QUEUED['gpu']} calls one after the other before each look at the clock (pipeline: one frame); device: for how "
     "long a call keeps the GPU busy, by the profiler; float32 products are TF32."
 )
 

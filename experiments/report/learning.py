@@ -34,7 +34,7 @@ def learning_section(training: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def binned(line: Line, bins: int = BINS) -> list[tuple[float, float]]:
-    """At most ``bins`` points, each the mean of those behind each other."""
+    """At most ``bins`` points, each the mean of neighbours."""
     size = max(math.ceil(len(line) / bins), 1)
     parts = [line[k : k + size] for k in range(0, len(line), size)]
     return [(sum(x for x, _ in part) / len(part), sum(y for _, y in part) / len(part)) for part in parts]

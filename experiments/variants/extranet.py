@@ -58,7 +58,7 @@ VARIANTS = {
         weights="extranet",
         page=Page(
             "ExtraSS 2023, Table 3",
-            "ExtraNet at output resolution, TAA behind it",
+            "ExtraNet at output resolution, then TAA",
             "TAA's settings: its defaults, not tuned",
             "a hole",
         ),

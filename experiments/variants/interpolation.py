@@ -39,7 +39,7 @@ VARIANTS = {
         weights="ifrnet",
         page=Page(
             "ExtraSS 2023, Table 3",
-            "IFRNet at output resolution, TAA behind it",
+            "IFRNet at output resolution, then TAA",
             "TAA's settings: its defaults, not tuned",
             "no: as above",
         ),
