@@ -8,7 +8,17 @@ from typing import Any, NamedTuple
 
 import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
-from essjax.scenes import EXTRA_FAMILIES, FAMILIES, families_of, make_scene, render_frame, render_sequence, split_seeds
+from essjax.scenes import (
+    EXTRA_FAMILIES,
+    FAMILIES,
+    Rendering,
+    families_of,
+    make_scene,
+    render_frame,
+    render_sequence,
+    split_seeds,
+)
+from essjax.scenes.sequence import USUAL
 
 RENDERER = "essjax.scenes 3"
 """How datasets of the built-in renderer name it; the number grows when the same seed gives another picture."""
@@ -41,6 +51,10 @@ class Clip(NamedTuple):
     def name(self) -> str:
         """Name of the sequence on disk."""
         return f"{self.split}-{self.family}-{self.seed:04d}"
+
+    def rendered(self, rendering: Rendering) -> Rendering:
+        """``rendering`` with what this clip says of it."""
+        return rendering._replace(spp=self.spp, native=self.native)
 
 
 def plan(
@@ -117,10 +131,7 @@ def generate(
     width: int,
     height: int,
     *,
-    scale: int = 2,
-    ranges: bool = False,
-    mip_bias: float = 0.0,
-    jitter: str = "halton",
+    rendering: Rendering = USUAL,
     progress: Progress = lambda done, total: None,
 ) -> Dataset:
     """Render clips into a dataset, frame by frame and atomically; running it again resumes.
@@ -133,20 +144,16 @@ def generate(
       clips: from ``plan``, of one split or several.
       width: LR width, pixels.
       height: LR height, pixels.
-      scale: reference size over frame size.
-      ranges: also the ranges over the reference's samples (what a classifier's labels are made of).
-      mip_bias: texture filter, see ``scenes.render_frame``.
-      jitter: pattern, "halton" or "dlctus", see ``scenes.jitter_sequence``.
+      rendering: all but ``spp`` and ``native``, which the clips have.
       progress: called after each frame.
 
     Raises:
       ValueError: the folder holds data made with other settings, or a setting is invalid.
     """
     out, clips = Path(out), list(clips)
-    shared = {"renderer": RENDERER, "width": width, "height": height, "scale": scale}
-    shared["mip_bias"] = float(mip_bias)
-    settings = {"scale": scale, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
-    shared |= {key: settings[key] for key, usual in UNSAID.items() if settings[key] != usual}
+    shared = {"renderer": RENDERER, "width": width, "height": height, "scale": rendering.scale}
+    shared["mip_bias"] = float(rendering.mip_bias)
+    shared |= {key: value for key, value in rendering._asdict().items() if value != UNSAID.get(key, value)}
     splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
     for clip in clips:
@@ -154,7 +161,7 @@ def generate(
         writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
         for index in range(clip.frames):
             if index not in writer:
-                frame = render_frame(scene, index, width, height, spp=clip.spp, native=clip.native, **settings)
+                frame = render_frame(scene, index, width, height, rendering=clip.rendered(rendering))
                 extra = {name: getattr(frame, name) for name in ("valid", "steady", "native", "ranges")}
                 writer.write(index, frame.frames, frame.reference, **extra)
             done += 1
@@ -170,11 +177,8 @@ def live_source(
     width: int,
     height: int,
     *,
-    scale: int = 2,
-    ranges: bool = False,
-    mip_bias: float = 0.0,
-    jitter: str = "halton",
-    on_frame: Callable[[int], Any] | None = None,
+    rendering: Rendering = USUAL,
+    on_frame: Callable[[int], Any] = lambda index: None,
 ) -> CachedSource:
     """Make a source for ``data.clips`` that renders each clip when first asked for it, without touching the disk.
 
@@ -182,16 +186,12 @@ def live_source(
       clips: from ``plan``.
       width: LR width, pixels.
       height: LR height, pixels.
-      scale: see ``generate``.
-      ranges: see ``generate``.
-      mip_bias: see ``generate``.
-      jitter: see ``generate``.
+      rendering: see ``generate``.
       on_frame: called with the index of each finished frame of a clip.
     """
 
     def render(clip: Clip) -> essjax.frames.Sequence:
         scene = make_scene(clip.family, clip.seed, clip.frames)
-        settings = {"scale": scale, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
-        return render_sequence(scene, width, height, spp=clip.spp, native=clip.native, on_frame=on_frame, **settings)
+        return render_sequence(scene, width, height, rendering=clip.rendered(rendering), on_frame=on_frame)
 
     return CachedSource(functools.partial(render, clip) for clip in clips)

@@ -17,6 +17,7 @@ from essjax.builtin import generate, plan
 from essjax.data import Dataset, ImportReport, import_dataset
 from essjax.data.check import CheckReport, check_dataset
 from essjax.data.layout import read_dataset, write_json
+from essjax.scenes import Rendering
 
 _console = Console()
 
@@ -116,9 +117,9 @@ def scenes(
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None
     clips = plan(split, sequences, frames, spp=spp, native=native, families=chosen, start=seed)
-    settings = {"scale": scale, "ranges": ranges, "mip_bias": mip_bias, "jitter": jitter}
+    rendering = Rendering(scale=scale, ranges=ranges, mip_bias=mip_bias, jitter=jitter)
     with progress_bar("rendering") as progress:
-        dataset = generate(out, clips, width, height, progress=progress, **settings)
+        dataset = generate(out, clips, width, height, progress=progress, rendering=rendering)
     _print_dataset(dataset)
 
 

@@ -8,7 +8,7 @@ from essjax.builtin import Clip, live_source
 from essjax.frames import Sequence, select_time
 from essjax.train import TrainState
 from essjax.typing import Array
-from experiments.datasets import render_settings
+from experiments.datasets import rendering_of
 from experiments.members import Member
 from experiments.settings import Settings
 from experiments.training import check_crop, clip_length, initial_state, make_step
@@ -19,7 +19,7 @@ def batch_shapes(settings: Settings, stage: Stage) -> Sequence:
     """What ``make_batches`` gives on the built-in scenes, as ``jax.ShapeDtypeStruct``s; one small frame is rendered."""
     width, height = check_crop(stage.settings, *settings.data.size, settings.data.scale)
     clip = Clip("train", "carousel", 0, frames=1, spp=1)
-    one = live_source([clip], width, height, **render_settings(settings), ranges=stage.ranges)[0]
+    one = live_source([clip], width, height, rendering=rendering_of(settings, ranges=stage.ranges))[0]
     lead = clip_length(stage, settings.data.train_frames), stage.settings.batch
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), leaf.dtype), one)
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from essjax.data.layout import write_json
 from experiments.benchmark.section import section
 from experiments.tables import get_table, markdown
 
@@ -69,7 +70,7 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
             for stage in runs[0].get("training", {})
         }
     path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps(merged, indent=1) + "\n")
+    write_json(path, merged)
     return path
 
 
@@ -85,7 +86,7 @@ def _keep_tables(name: str, paths: Sequence[Path], content: dict[str, Any]) -> P
     if len(paths) > 1:
         raise ValueError(f"{name}: expected one file of tables, got {len(paths)}.")
     path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    write_json(path, content)
     return path
 
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from essjax.builtin import Clip, generate, plan
 from essjax.data import Dataset
+from essjax.scenes import Rendering
 from experiments.settings import Settings
 
 ROUNDS = 10_000
@@ -32,9 +32,10 @@ def scene_clips(settings: Settings) -> list[Clip]:
     ]
 
 
-def render_settings(settings: Settings) -> dict[str, Any]:
-    """Of the built-in renderer, for all splits."""
-    return {"scale": settings.data.scale, "mip_bias": settings.data.mip_bias, "jitter": settings.data.jitter}
+def rendering_of(settings: Settings, *, ranges: bool) -> Rendering:
+    """How the built-in scenes of all splits are rendered."""
+    data = settings.data
+    return Rendering(scale=data.scale, ranges=ranges, mip_bias=data.mip_bias, jitter=data.jitter)
 
 
 def prepare(
@@ -62,8 +63,8 @@ def prepare(
     if data is not None:
         dataset = data
     else:
-        options = {**render_settings(settings), "ranges": ranges}
-        dataset = generate(out / "scenes", scene_clips(settings), *settings.data.size, progress=progress, **options)
+        rendering, clips = rendering_of(settings, ranges=ranges), scene_clips(settings)
+        dataset = generate(out / "scenes", clips, *settings.data.size, rendering=rendering, progress=progress)
     for split in ("train", "validation", "test"):
         if not dataset.splits.get(split):
             raise ValueError(

@@ -10,6 +10,7 @@ from rich.console import Console
 from essjax.builtin import generate, plan
 from essjax.frames import select_time
 from essjax.rollout import ESS, SS, stream
+from experiments.datasets import rendering_of
 from experiments.members import resolve, settings_of
 from experiments.settings import with_value
 from experiments.trace import describe, operations
@@ -24,7 +25,9 @@ def write_profile(
     member, folder = resolve({name: settings}, preset, out)[name], out / "profile"
     stages, method = member.stages, member.method
     clips = plan("train", 1, max([3, *(stage.settings.clip for stage in stages)]), spp=1, families=["carousel"])
-    dataset = generate(out / "profile-scenes", clips, *settings.data.size, scale=settings.data.scale)
+    dataset = generate(
+        out / "profile-scenes", clips, *settings.data.size, rendering=rendering_of(settings, ranges=False)
+    )
     if stages:
         stage = stages[-1]
         variables = initial_variables(member, dataset)

@@ -29,7 +29,7 @@ from essjax.train import (
     train,
 )
 from essjax.typing import PyTree
-from experiments.datasets import render_settings, train_clips
+from experiments.datasets import rendering_of, train_clips
 from experiments.members import Member
 from experiments.settings import Settings, StageSettings, with_value
 from experiments.validation import Scorer
@@ -117,8 +117,8 @@ def make_batches(dataset: Dataset, settings: Settings, stage: Stage, *, prefetch
         return iter(cutter(stage)(source, **cut, seed=settings.seed + number))
 
     def fresh(number: int) -> CachedSource:
-        options = {**render_settings(settings), "ranges": stage.ranges}
-        return live_source(train_clips(settings, number), dataset.info.width, dataset.info.height, **options)
+        rendering, clips = rendering_of(settings, ranges=stage.ranges), train_clips(settings, number)
+        return live_source(clips, dataset.info.width, dataset.info.height, rendering=rendering)
 
     return make(0) if settings.data.fresh is None else Rounds(make, settings.data.fresh)
 

@@ -11,7 +11,7 @@ from essjax import cli
 from essjax.builtin import Clip, generate, live_source, plan
 from essjax.data import clips, read_dataset, read_sequence
 from essjax.frames import select_time, validate_sequence
-from essjax.scenes import TEST_ONLY_FAMILIES, TRAIN_FAMILIES
+from essjax.scenes import TEST_ONLY_FAMILIES, TRAIN_FAMILIES, Rendering
 from tests.data.importing.dumps import truth
 from tests.data.importing.test_blender import dump  # noqa: F401 (fixture)
 from tests.data.importing.test_presets import write_extranet
@@ -29,9 +29,18 @@ def instant_renderer(monkeypatch):
     """Frames of noise in place of rendered ones; returns the list of (family, seed, frame) that were asked for."""
     calls = []
 
-    def render_frame(scene, index, width, height, *, scale, spp, native, ranges, mip_bias, jitter):
+    def render_frame(scene, index, width, height, *, rendering):
         calls.append((scene.family, scene.seed, index))
-        noise = make_sequence(scene.seed, index + 1, 1, height, width, scale=scale, native=native, ranges=ranges)
+        noise = make_sequence(
+            scene.seed,
+            index + 1,
+            1,
+            height,
+            width,
+            scale=rendering.scale,
+            native=rendering.native,
+            ranges=rendering.ranges,
+        )
         frame = select_time(jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), noise), index)
         return dataclasses.replace(frame, steady=frame.valid)
 
@@ -109,9 +118,9 @@ def test_a_dataset_grows_but_does_not_change(tmp_path, instant_renderer):
     with pytest.raises(ValueError, match=r"made with width = 8, asked for 10\. Choose another output folder"):
         generate(tmp_path, gloss, 10, 6)
     with pytest.raises(ValueError, match=r"made with ranges = False, asked for True\. Choose another output folder"):
-        generate(tmp_path, gloss, 8, 6, ranges=True)
+        generate(tmp_path, gloss, 8, 6, rendering=Rendering(ranges=True))
     with pytest.raises(ValueError, match="made with jitter = 'halton', asked for 'dlctus'"):
-        generate(tmp_path, gloss, 8, 6, jitter="dlctus")
+        generate(tmp_path, gloss, 8, 6, rendering=Rendering(jitter="dlctus"))
     with pytest.raises(ValueError, match=r"other settings \(frames: asked 4, found 3\)"):
         generate(tmp_path, plan("train", 2, 4, families=["gloss"]), 8, 6)
     with pytest.raises(ValueError, match="two clips have the same split, family and seed"):
@@ -129,7 +138,9 @@ def test_scenes_command_renders_what_the_live_source_renders(tmp_path, capsys):
     assert output.endswith("steady; sample ranges")
     dataset = read_dataset(tmp_path / "out")
     disk = read_sequence(dataset, "train-corridor-0000", ranges=True)
-    source = live_source(plan("train", 1, 3, families=["corridor"], spp=4), 16, 10, ranges=True, jitter="dlctus")
+    source = live_source(
+        plan("train", 1, 3, families=["corridor"], spp=4), 16, 10, rendering=Rendering(ranges=True, jitter="dlctus")
+    )
     validate_sequence(source[0], "live")
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), disk, source[0])
     assert next(iter(clips(source, length=2, batch=2, crop=(8, 8)))).reference.shape == (2, 2, 16, 16, 3)

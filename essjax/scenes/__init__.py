@@ -17,10 +17,10 @@ from essjax.scenes.families import (
     split_seeds,
 )
 from essjax.scenes.jitter import jitter_sequence
-from essjax.scenes.sequence import iterate_frames, render_frame, render_sequence, subsample_statistics
+from essjax.scenes.sequence import Rendering, iterate_frames, render_frame, render_sequence, subsample_statistics
 
 __all__ = [
-    "EXTRA_FAMILIES", "FAMILIES", "SPLITS", "TEST_ONLY_FAMILIES", "TRAIN_FAMILIES", "Scene", "families_of",
+    "EXTRA_FAMILIES", "FAMILIES", "SPLITS", "TEST_ONLY_FAMILIES", "TRAIN_FAMILIES", "Rendering", "Scene", "families_of",
     "iterate_frames", "jitter_sequence", "make_scene", "render_frame", "render_sequence", "split_scenes",
     "split_seeds", "subsample_statistics",
 ]  # fmt: skip

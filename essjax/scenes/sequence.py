@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +15,33 @@ from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
 from essjax.scenes.world import World
 from essjax.typing import Callable
+
+
+class Rendering(NamedTuple):
+    """How frames of a scene are rendered.
+
+    Attributes:
+      scale: reference size over frame size.
+      spp: samples per reference pixel.
+      native: also render 1-sample frames at the reference's size; their jitter advances every frame.
+      ranges: also the ranges over the reference's samples (what a classifier's labels are made of), see
+        ``subsample_statistics``.
+      mip_bias: texture filter of LR and native frames, log2 of its width over an output pixel's: 0 is what
+        upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
+        Eq 47 of thesis 002, -log2(f) - log2(spp) / 2 over an *input* pixel, is ``-log2(spp) / 2`` here: 0 for its
+        dataset 1 (1 sample per pixel), -1 for its dataset 2 (4 samples per pixel).
+      jitter: pattern of the LR frames, see ``jitter_sequence``; native frames always have Halton's.
+    """
+
+    scale: int = 2
+    spp: int = 64
+    native: bool = False
+    ranges: bool = False
+    mip_bias: float = 0.0
+    jitter: str = "halton"
+
+
+USUAL = Rendering()
 
 
 def _camera(world: World, width: int, height: int) -> Camera:
@@ -47,10 +75,7 @@ def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray
     return frame, images["valid"], images["steady"]
 
 
-def render_frame(
-    scene: Scene, index: int, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
-    ranges: bool = False, mip_bias: float = 0.0, jitter: str = "halton",
-) -> Sequence:  # fmt: skip
+def render_frame(scene: Scene, index: int, width: int, height: int, *, rendering: Rendering = USUAL) -> Sequence:
     """One frame of ``scene`` as a ``Sequence`` without time axis (leaves ``[H, W, C]``), NumPy arrays.
 
     Radiance is in the scene's ``unit``, and exposure its inverse. At a cut motion is that of a static scene seen by a
@@ -61,19 +86,12 @@ def render_frame(
       index: frame number; only it and the frame before matter, so rendering can start anywhere.
       width: LR width, pixels.
       height: LR height, pixels.
-      scale: reference size over frame size.
-      spp: samples per reference pixel.
-      native: also render 1-sample frames at the reference's size; their jitter advances every frame.
-      ranges: also the ranges over the reference's samples, see ``subsample_statistics``.
-      mip_bias: texture filter of LR and native frames, log2 of its width over an output pixel's: 0 is what
-        upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
-        Eq 47 of thesis 002, -log2(f) - log2(spp) / 2 over an *input* pixel, is ``-log2(spp) / 2`` here: 0 for its
-        dataset 1 (1 sample per pixel), -1 for its dataset 2 (4 samples per pixel).
-      jitter: pattern of the LR frames, see ``jitter_sequence``; native frames always have Halton's.
+      rendering: what is rendered of it.
 
     Raises:
       ValueError: a size is not a positive whole number, there is no frame ``index``, or no such jitter pattern.
     """
+    scale, spp, native, ranges, mip_bias, jitter = rendering
     _check_size(width, height, scale, spp)
     offset = jitter_sequence(index + 1, pattern=jitter, scale=scale)[index]
     world = scene.at(index)
@@ -104,40 +122,37 @@ def _ranges(images: dict[str, np.ndarray], unit: float) -> SampleRanges:
 
 
 def iterate_frames(
-    scene: Scene, width: int, height: int, *, start: int = 0, stop: int | None = None, **settings
+    scene: Scene, width: int, height: int, *, start: int = 0, stop: int | None = None, rendering: Rendering = USUAL
 ) -> Iterator[tuple[int, Sequence]]:
-    """Yield ``(n, render_frame(scene, n, width, height, **settings))`` for n from ``start`` up to ``stop``.
+    """Yield ``(n, render_frame(scene, n, width, height, rendering=rendering))`` for n from ``start`` up to ``stop``.
 
     For writers that store frame by frame and resume at frame ``start``.
     """
     for index in range(start, scene.frames if stop is None else stop):
-        yield index, render_frame(scene, index, width, height, **settings)
+        yield index, render_frame(scene, index, width, height, rendering=rendering)
 
 
 def render_sequence(
-    scene: Scene, width: int, height: int, *, scale: int = 2, spp: int = 64, native: bool = False,
-    ranges: bool = False, mip_bias: float = 0.0, jitter: str = "halton",
-    on_frame: Callable[[int], None] | None = None,
-) -> Sequence:  # fmt: skip
+    scene: Scene,
+    width: int,
+    height: int,
+    *,
+    rendering: Rendering = USUAL,
+    on_frame: Callable[[int], None] = lambda index: None,
+) -> Sequence:
     """All frames of ``scene``: a ``Sequence`` whose leaves are ``[T, H, W, C]`` float32 NumPy arrays.
 
     Args:
       scene: from ``make_scene``.
       width: LR width, pixels.
       height: LR height, pixels.
-      scale: see ``render_frame``.
-      spp: see ``render_frame``.
-      native: see ``render_frame``.
-      ranges: see ``render_frame``.
-      mip_bias: see ``render_frame``.
-      jitter: see ``render_frame``.
+      rendering: what is rendered of it.
       on_frame: called with the index of each finished frame (progress bars).
     """
-    parts, settings = [], {"scale": scale, "spp": spp, "native": native, "mip_bias": mip_bias, "jitter": jitter}
-    for index, part in iterate_frames(scene, width, height, ranges=ranges, **settings):
+    parts = []
+    for index, part in iterate_frames(scene, width, height, rendering=rendering):
         parts.append(part)
-        if on_frame is not None:
-            on_frame(index)
+        on_frame(index)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
 
 

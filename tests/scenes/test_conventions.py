@@ -12,7 +12,7 @@ W, H = 31, 17
 
 
 def frame_of(scene, index, **settings):
-    return scenes.render_frame(scene, index, W, H, spp=1, **settings)
+    return scenes.render_frame(scene, index, W, H, rendering=scenes.Rendering(spp=1, **settings))
 
 
 def test_object_moving_right_has_negative_motion(moving_box):

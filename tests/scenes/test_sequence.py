@@ -6,7 +6,7 @@ import pytest
 
 from essjax import frames, scenes, warp
 from essjax.color import reinhard
-from essjax.scenes import render
+from essjax.scenes import Rendering, render
 
 SIZE = (36, 20)
 
@@ -57,7 +57,7 @@ def test_errors_say_what_to_do():
 
 def test_sequence_is_valid_with_native_frames_and_resumes():
     scene, done = scenes.make_scene("carousel", 3, 3), []
-    sequence = scenes.render_sequence(scene, *SIZE, spp=4, native=True, on_frame=done.append)
+    sequence = scenes.render_sequence(scene, *SIZE, on_frame=done.append, rendering=Rendering(spp=4, native=True))
     assert done == [0, 1, 2] and sequence.scale == 2
     frames.validate_sequence(sequence, requires=frames.OPTIONAL_GBUFFERS)
     assert sequence.frames.color.shape == (3, 20, 36, 3) and sequence.frames.color.dtype == np.float32
@@ -66,18 +66,18 @@ def test_sequence_is_valid_with_native_frames_and_resumes():
     np.testing.assert_array_equal(sequence.native.jitter, scenes.jitter_sequence(3, every_frame=True))
     np.testing.assert_array_equal(sequence.frames.jitter, scenes.jitter_sequence(3))
     assert list(sequence.frames.cut) == [True, False, False]
-    resumed = list(scenes.iterate_frames(scene, *SIZE, start=2, spp=4, native=True))
+    resumed = list(scenes.iterate_frames(scene, *SIZE, start=2, rendering=Rendering(spp=4, native=True)))
     assert [n for n, _ in resumed] == [2]
     leaves_equal(resumed[0][1], frames.select_time(sequence, 2))
-    other = scenes.render_frame(scene, 2, *SIZE, spp=4, native=True, jitter="dlctus")
+    other = scenes.render_frame(scene, 2, *SIZE, rendering=Rendering(spp=4, native=True, jitter="dlctus"))
     np.testing.assert_array_equal(other.frames.jitter, scenes.jitter_sequence(3, pattern="dlctus")[2])
     np.testing.assert_array_equal(other.native.jitter, sequence.native.jitter[2])
 
 
 def test_nothing_recompiles_for_another_frame_size_or_family():
-    scenes.render_frame(scenes.make_scene("carousel", 3, 3), 1, *SIZE, spp=4)
+    scenes.render_frame(scenes.make_scene("carousel", 3, 3), 1, *SIZE, rendering=Rendering(spp=4))
     sizes = render.color_along._cache_size(), render.buffers._cache_size()
-    scenes.render_frame(scenes.make_scene("gloss", 1, 4), 2, 41, 23, spp=9)
+    scenes.render_frame(scenes.make_scene("gloss", 1, 4), 2, 41, 23, rendering=Rendering(spp=9))
     assert (render.color_along._cache_size(), render.buffers._cache_size()) == sizes
 
 
@@ -85,8 +85,8 @@ def test_a_cut_ends_history():
     scene = scenes.make_scene("cuts", 0, 40)
     (cuts,) = np.nonzero(scene.cut)
     assert len(cuts) >= 3 and cuts[0] == 0 and 3 <= cuts[1] <= 5
-    at_cut = scenes.render_frame(scene, int(cuts[1]), *SIZE, spp=1)
-    after = scenes.render_frame(scene, int(cuts[1]) + 1, *SIZE, spp=1)
+    at_cut = scenes.render_frame(scene, int(cuts[1]), *SIZE, rendering=Rendering(spp=1))
+    after = scenes.render_frame(scene, int(cuts[1]) + 1, *SIZE, rendering=Rendering(spp=1))
     assert at_cut.frames.cut and not after.frames.cut
     assert not at_cut.valid.any() and after.valid.mean() > 0.7
     np.testing.assert_allclose(at_cut.frames.motion, 0.0, atol=1e-2)
@@ -98,7 +98,7 @@ def test_short_clips_have_a_cut():
 
 
 def test_there_is_hdr_sky_and_glowing_matter():
-    s = scenes.render_frame(scenes.make_scene("plaza", 2, 2), 1, 96, 54, spp=4)
+    s = scenes.render_frame(scenes.make_scene("plaza", 2, 2), 1, 96, 54, rendering=Rendering(spp=4))
     assert s.reference.max() > 8
     sky = ~np.isfinite(s.frames.gbuffers.depth)
     assert 0.05 < sky.mean() < 0.8
@@ -106,7 +106,7 @@ def test_there_is_hdr_sky_and_glowing_matter():
 
 def test_rigging_is_thinner_than_a_pixel_before_a_plain_sky():
     """High above the hull, at 96 x 54: rope in pixels whose sample is sky, and sky in pixels whose sample is rope."""
-    s = scenes.render_frame(scenes.make_scene("rigging", 2, 3), 2, 96, 54, spp=16)
+    s = scenes.render_frame(scenes.make_scene("rigging", 2, 3), 2, 96, 54, rendering=Rendering(spp=16))
     sky = ~np.isfinite(s.frames.gbuffers.depth[..., 0])
     assert 0.3 < sky.mean() < 0.6
     above, sky = np.asarray(reinhard(s.reference)).reshape(54, 2, 96, 2, 3).mean((1, 3))[:12], sky[:12]
@@ -118,8 +118,8 @@ def test_rigging_is_thinner_than_a_pixel_before_a_plain_sky():
 
 def test_mip_bias_blurs_frames_but_not_the_reference():
     scene = scenes.make_scene("texture", 4, 2)
-    sharp = scenes.render_frame(scene, 1, *SIZE, spp=4)
-    soft = scenes.render_frame(scene, 1, *SIZE, spp=4, mip_bias=4.0)
+    sharp = scenes.render_frame(scene, 1, *SIZE, rendering=Rendering(spp=4))
+    soft = scenes.render_frame(scene, 1, *SIZE, rendering=Rendering(spp=4, mip_bias=4.0))
     detail = lambda s: np.abs(np.diff(s.frames.gbuffers.base_color, axis=1)).mean()
     assert detail(soft) < 0.7 * detail(sharp)
     np.testing.assert_array_equal(sharp.reference, soft.reference)
@@ -133,7 +133,8 @@ def test_scenes_have_units_of_their_own_and_record_the_exposure():
     assert all(np.log2(unit) % 1 == 0 and 2.0**-7 <= unit < 2.0**7 for unit in everywhere)
     scene = next(s for s in (scenes.make_scene("gloss", seed, 2) for seed in range(20)) if s.unit != 1)
     plain = dataclasses.replace(scene, unit=1.0)
-    ours, same = (scenes.render_frame(s, 1, *SIZE, spp=4, native=True, ranges=True) for s in (scene, plain))
+    rendering = Rendering(spp=4, native=True, ranges=True)
+    ours, same = (scenes.render_frame(s, 1, *SIZE, rendering=rendering) for s in (scene, plain))
     assert float(same.frames.exposure) == 1.0 and float(ours.frames.exposure) == 1.0 / scene.unit
     for of in (lambda s: s.frames.color, lambda s: s.reference, lambda s: s.native.color,
                lambda s: s.ranges.color_min, lambda s: s.ranges.color_max):  # fmt: skip
@@ -164,7 +165,7 @@ def test_reference_converges():
 
 def test_statistics_bound_the_reference_and_bumps_add_spread():
     scene = scenes.make_scene("texture", 1, 2)
-    frame = scenes.render_frame(scene, 1, *SIZE, scale=1, spp=16, ranges=True)
+    frame = scenes.render_frame(scene, 1, *SIZE, rendering=Rendering(scale=1, spp=16, ranges=True))
     stats, reference = frame.ranges, scene.unit * render.render_reference(scene.at(1), *SIZE, spp=16)
     leaves_equal(stats, scenes.subsample_statistics(scene, 1, *SIZE, spp=16))
     np.testing.assert_array_equal(frame.reference, reference)
@@ -180,7 +181,7 @@ def test_statistics_bound_the_reference_and_bumps_add_spread():
 def test_motion_of_the_nearest_sample():
     """Inside surfaces that of the frame's one sample; at silhouettes it belongs to the foreground."""
     scene = scenes.make_scene("carousel", 3, 4)
-    frame = scenes.render_frame(scene, 3, *SIZE, scale=1, spp=16, ranges=True)
+    frame = scenes.render_frame(scene, 3, *SIZE, rendering=Rendering(scale=1, spp=16, ranges=True))
     stats = frame.ranges
     smooth = np.isfinite(stats.depth_max) & (stats.depth_max < 1.02 * stats.depth_min)
     difference = np.linalg.norm(stats.motion - frame.frames.motion, axis=-1, keepdims=True)
@@ -196,7 +197,7 @@ def gain(family, seed, index):
     scene = scenes.make_scene(family, seed, index + 1)
     width, height = 288, 162
     before = render.render_reference(scene.at(index - 1), width, height, spp=16)
-    now = scenes.render_frame(scene, index, width, height, scale=1, spp=16)
+    now = scenes.render_frame(scene, index, width, height, rendering=Rendering(scale=1, spp=16))
     mask = now.valid * now.steady
     warped = np.asarray(warp.backward_warp(before, now.frames.motion))
     target = np.asarray(reinhard(now.reference * now.frames.exposure))

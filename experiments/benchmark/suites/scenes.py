@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import jax
 
-from essjax.scenes import make_scene, render_frame
+from essjax.scenes import Rendering, make_scene, render_frame
 from essjax.scenes.render import render_reference
 from experiments.benchmark.measure import Compilations, summary, time_calls
 from experiments.benchmark.suites import Options, Row
@@ -26,7 +26,8 @@ def rows(options: Options) -> Iterator[Row]:
         )  # fmt: skip
         yield _row(
             f"frame and buffers of {family}, {width}x{height}, no reference",
-            lambda scene=scene: render_frame(scene, 1, width, height, spp=1), options, {"pixels": width * height},
+            lambda scene=scene: render_frame(scene, 1, width, height, rendering=Rendering(spp=1)),
+            options, {"pixels": width * height},
         )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from essjax.train import create_state, make_train_step, muon
 from experiments.benchmark import inputs
 from experiments.benchmark.measure import Case, measure, summary
 from experiments.benchmark.suites import Options, Row
+from experiments.datasets import rendering_of
 from experiments.members import Member, resolve, settings_of
 from experiments.training import first_batch, initial_state, initial_variables, make_batches, make_step
 from experiments.variants import Stage
@@ -108,7 +109,7 @@ def _loaded(*overrides: str) -> Row:
     data, training = settings.data, stage.settings
     with tempfile.TemporaryDirectory() as folder:
         clips = plan("train", 1, data.train_frames, spp=1, families=["carousel"])
-        dataset = generate(Path(folder), clips, *data.size, scale=data.scale)
+        dataset = generate(Path(folder), clips, *data.size, rendering=rendering_of(settings, ranges=False))
         step = make_step(stage, settings)
         variables = initial_variables(member, dataset)
         state = initial_state(member, stage, variables, first_batch(dataset, settings, stage))
