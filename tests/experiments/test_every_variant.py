@@ -12,11 +12,10 @@ import pytest
 from essjax.builtin import plan
 from essjax.frames import frame_images, select_time
 from essjax.rollout import alternate, every, unroll
-from essjax.train import adam, create_state, make_train_step
 from experiments import datasets
 from experiments.ahead import batch_shapes, state_shapes
 from experiments.members import resolve, settings_of
-from experiments.training import initial_variables, make_batches
+from experiments.training import initial_state, initial_variables, make_batches, make_step
 from experiments.variants import VARIANTS
 from tests.helpers import streamed
 
@@ -53,14 +52,10 @@ def train(name, dataset):
     """Train every stage of a variant on one batch; stage -> losses, and the variables."""
     settings = settings_of(name, "smoke", SIZES)
     member = resolve({name: settings}, "smoke", Path())[name]
-    stages, losses = member.stages, {}
-    variables = initial_variables(member, dataset)
-    for stage in stages:
-        transform = adam()
-        step = make_train_step(stage.objective, transform, stage.name)
-        names = [s.name for s in stages[: stages.index(stage) + 1]]
-        state = create_state({entry: variables[entry] for entry in names}, stage.name, transform)
+    variables, losses = initial_variables(member, dataset), {}
+    for stage in member.stages:
         batch, losses[stage.name] = next(make_batches(dataset, settings, stage)), []
+        step, state = make_step(stage, settings), initial_state(member, stage, variables, batch)
         expected = batch_shapes(settings, stage)  # what the run command compiles for, before there are data
         assert_same_shapes(expected, batch)
         assert_same_shapes(state_shapes(member, stage, expected), state)
