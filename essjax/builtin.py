@@ -161,9 +161,7 @@ def generate(
         writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
         for index in range(clip.frames):
             if index not in writer:
-                frame = render_frame(scene, index, width, height, rendering=clip.rendered(rendering))
-                extra = {name: getattr(frame, name) for name in ("valid", "steady", "native", "ranges")}
-                writer.write(index, frame.frames, frame.reference, **extra)
+                writer.write(index, render_frame(scene, index, width, height, rendering=clip.rendered(rendering)))
             done += 1
             progress(done, total)
         writer.finish()

@@ -1,4 +1,4 @@
-"""``Sequence``s to a dataset folder, frame by frame."""
+"""``Sequence``s to a dataset folder, frame by frame: the ledger of what is there, and how it may go on."""
 
 import dataclasses
 import os
@@ -11,40 +11,15 @@ import jax
 import numpy as np
 import OpenEXR
 
-from essjax.buffers import RANGES
-from essjax.data import exr
-from essjax.data.layout import (
-    AGREE,
-    KINDS,
-    SUFFIXES,
-    SequenceInfo,
-    frame_path,
-    read_sequence_info,
-    write_sequence_info,
-)
-from essjax.data.records import differences, digest, frame_record, plain, planes_of
-from essjax.frames import (
-    Frame,
-    SampleRanges,
-    Sequence,
-    frame_images,
-    select_time,
-    validate_frame,
-    validate_ranges,
-)
+from essjax.data import encode
+from essjax.data.layout import AGREE, KINDS, SequenceInfo, frame_path, read_sequence_info, write_sequence_info
+from essjax.data.records import differences, digest, frame_record, plain
+from essjax.frames import Sequence, select_time
 
 FAST = {"compression": OpenEXR.RLE_COMPRESSION}
 """For imports, which ZIP would dominate: lossless in a third of its time, for a quarter more disk (path-traced)."""
 DISAGREES = "all frames of a sequence must agree"
 """Part of the message about a frame of another size or with other channels than those before."""
-
-
-class _Extra(NamedTuple):
-    """What a frame may have beside its images and its reference."""
-
-    masks: Mapping[str, Any] = {}
-    native: Frame | None = None
-    ranges: SampleRanges | None = None
 
 
 class PreparedFrame(NamedTuple):
@@ -139,26 +114,6 @@ class SequenceWriter:
         """Whether the sequence is finished."""
         return self.info is not None and self.info.complete
 
-    def _describe(self, frame: Frame, reference: Any, extra: _Extra) -> SequenceInfo:
-        height, width = frame.motion.shape[-3:-1]
-        scale = reference.shape[0] // height
-        if reference.shape != (scale * height, scale * width, 3) or scale < 1:
-            raise ValueError(
-                f"sequence {self.name}, reference: expected [s*{height}, s*{width}, 3] with a whole s, "
-                f"got {tuple(reference.shape)}."
-            )
-        native, ranges = extra.native, extra.ranges
-        if native is not None and native.motion.shape != (*reference.shape[:2], 2):
-            raise ValueError(
-                f"sequence {self.name}, native frames: expected the reference's size {reference.shape[:2]}, "
-                f"got {tuple(native.motion.shape[:2])}."
-            )
-        present = {**frame_images(frame), **extra.masks}
-        channels = tuple(name for name in SUFFIXES if name in present)
-        return SequenceInfo(
-            self.name, width, height, scale, channels, native is not None, self.source, ranges=ranges is not None
-        )
-
     def _check_next(self, number: int, described: SequenceInfo, cut: bool, exposure: Any) -> SequenceInfo:
         info = self.info or described
         for field in (*AGREE, "native"):
@@ -180,28 +135,12 @@ class SequenceWriter:
             )
         return info
 
-    def write(
-        self,
-        number: int,
-        frame: Frame,
-        reference: Any,
-        *,
-        valid: Any = None,
-        steady: Any = None,
-        native: Frame | None = None,
-        ranges: SampleRanges | None = None,
-        notes: Mapping[str, Any] | None = None,
-    ) -> None:
+    def write(self, number: int, content: Sequence, *, notes: Mapping[str, Any] | None = None) -> None:
         """Write one frame. Nothing happens if it is already complete, with the same content.
 
         Args:
           number: original frame number; consecutive, unless the frame is a cut.
-          frame: leaves ``[H, W, C]``, with colour.
-          reference: ``[s*H, s*W, 3]``.
-          valid: ``[H, W, 1]`` or None.
-          steady: ``[H, W, 1]`` or None.
-          native: leaves ``[s*H, s*W, C]`` or None.
-          ranges: leaves ``[s*H, s*W, C]`` or None.
+          content: without a time axis: leaves ``[H, W, C]``, with colour.
           notes: numbers about this frame to keep in its record; ``clamped``, the count of values beyond half's range
             that were clamped, is added.
 
@@ -209,15 +148,13 @@ class SequenceWriter:
           ValueError: invalid content, it does not fit to the frames before, or the frame is complete with other
             content (not noticed where an older essjax wrote it); names sequence, frame and channel.
         """
-        masks = {name: mask for name, mask in (("valid", valid), ("steady", steady)) if mask is not None}
-        extra = _Extra(masks, native, ranges)
-        frame, reference, extra = jax.tree.map(np.asarray, (frame, reference, extra))
-        made_from = digest((frame, reference, extra))
+        content = jax.tree.map(np.asarray, content)
+        made_from = digest(content)
         if self._is_there(number, made_from):
             return
-        self._validate(number, frame, reference, extra)
-        self._check_next(number, self._describe(frame, reference, extra), bool(frame.cut), frame.exposure)
-        self.commit(self._write_images(number, frame, reference, extra, notes or {}, {}, made_from))
+        frame = content.frames
+        self._check_next(number, self.describe(number, content), bool(frame.cut), frame.exposure)
+        self.commit(self._write_images(number, content, notes or {}, {}, made_from))
 
     def _is_there(self, number: int, made_from: str) -> bool:
         if number not in self:
@@ -231,24 +168,18 @@ class SequenceWriter:
             )
         return True
 
-    def describe(self, number: int, frame: Frame, reference: Any) -> SequenceInfo:
+    def describe(self, number: int, content: Sequence) -> SequenceInfo:
         """What a sequence of such frames looks like; nothing is written.
 
         Raises:
           ValueError: invalid content.
         """
-        frame, reference = jax.tree.map(np.asarray, (frame, reference))
-        self._validate(number, frame, reference, _Extra())
-        return self._describe(frame, reference, _Extra())
+        content = jax.tree.map(np.asarray, content)
+        encode.validate(content, f"sequence {self.name}, frame {number}")
+        return encode.describe(content, self.name, self.source)
 
     def prepare(
-        self,
-        number: int,
-        frame: Frame,
-        reference: Any,
-        *,
-        notes: Mapping[str, Any] | None = None,
-        made_from: str = "",
+        self, number: int, content: Sequence, *, notes: Mapping[str, Any] | None = None, made_from: str = ""
     ) -> PreparedFrame:
         """The first half of ``write``: write the images of a frame that ``describe`` accepts.
 
@@ -256,16 +187,14 @@ class SequenceWriter:
 
         Args:
           number: see ``write``.
-          frame: see ``write``.
-          reference: see ``write``.
+          content: see ``write``.
           notes: see ``write``.
           made_from: what the frame was made from, a short text to recognise a change by.
 
         Raises:
           ValueError: the images cannot be written.
         """
-        frame, reference = jax.tree.map(np.asarray, (frame, reference))
-        return self._write_images(number, frame, reference, _Extra(), notes or {}, FAST, made_from)
+        return self._write_images(number, jax.tree.map(np.asarray, content), notes or {}, FAST, made_from)
 
     def skip(self, number: int, reason: str, made_from: str) -> None:
         """Keep in ``sequence.json`` that a frame was left out, why, and what it was made from (see ``prepare``)."""
@@ -303,51 +232,17 @@ class SequenceWriter:
         """Remove the images of a frame that is not listed, if this writer wrote them."""
         if number in self._mine and number not in self:
             for kind in KINDS:
-                self._path(kind, number).unlink(missing_ok=True)
-
-    def _validate(self, number: int, frame: Frame, reference: np.ndarray, extra: _Extra) -> None:
-        where = f"sequence {self.name}, frame {number}"
-        validate_frame(frame, where, ("color",))
-        if extra.native is not None:
-            validate_frame(extra.native, f"{where}, native", ("color",))
-        if extra.ranges is not None:
-            validate_ranges(extra.ranges, reference.shape[0], reference.shape[1], f"{where}, ranges")
-        bad = ~(np.isfinite(reference) & (reference >= 0))
-        if bad.any():
-            raise ValueError(
-                f"{where}, reference: expected finite radiance >= 0, got {reference[bad][0]}. "
-                f"{int(bad.sum())} of {bad.size} values are negative, infinite or NaN: clean the frame or clamp them."
-            )
+                frame_path(self.root, self.name, kind, number).unlink(missing_ok=True)
 
     def _write_images(
-        self,
-        number: int,
-        frame: Frame,
-        reference: np.ndarray,
-        extra: _Extra,
-        notes: Mapping,
-        attributes: Mapping,
-        made_from: str,
+        self, number: int, content: Sequence, notes: Mapping, attributes: Mapping, made_from: str
     ) -> PreparedFrame:
-        described = self._describe(frame, reference, extra)
+        described = encode.describe(content, self.name, self.source)
         self._claim(described)
         self._mine.add(number)
-        files = {
-            "lr": planes_of({**frame_images(frame), **extra.masks}),
-            "hr": {name: reference[..., i] for i, name in enumerate("RGB")},
-        }
-        if extra.native is not None:
-            files["native"] = planes_of(frame_images(extra.native))
-        if extra.ranges is not None:
-            files["ranges"] = planes_of({name: getattr(extra.ranges, name) for name in RANGES})
-        clamped = sum(
-            exr.write(self._path(kind, number), planes, attributes=attributes) for kind, planes in files.items()
-        )
-        record = frame_record(number, frame, extra.native, made_from) | {"notes": {**notes, "clamped": clamped}}
-        return PreparedFrame(number, described, plain(record))
-
-    def _path(self, kind: str, number: int) -> Path:
-        return frame_path(self.root, self.name, kind, number)
+        clamped = encode.write_images(content, self.root, self.name, number, attributes)
+        record = frame_record(number, content.frames, content.native, made_from)
+        return PreparedFrame(number, described, plain({**record, "notes": {**notes, "clamped": clamped}}))
 
     def finish(self) -> SequenceInfo:
         """Mark the sequence as complete: from now on it can be read."""
@@ -391,7 +286,5 @@ def write_sequence(
             "write. Choose another name or output folder, or delete this one."
         )
     for index in range(length):
-        at: Sequence = select_time(sequence, index)
-        extra = {name: getattr(at, name) for name in ("valid", "steady", "native", "ranges")}
-        writer.write(first + index, at.frames, at.reference, **extra)
+        writer.write(first + index, select_time(sequence, index))
     return writer.finish()

@@ -38,9 +38,7 @@ def assert_close(actual, expected):
 
 def write_frames(writer, source, numbers, first):
     for number in numbers:
-        at = select_time(source, number - first)
-        extra = {name: getattr(at, name) for name in ("valid", "steady", "native", "ranges")}
-        writer.write(number, at.frames, at.reference, **extra)
+        writer.write(number, select_time(source, number - first))
 
 
 @pytest.mark.parametrize("native", [False, True])
@@ -225,11 +223,11 @@ def test_frames_must_follow_each_other(tmp_path):
     write_frames(writer, source, [0], 0)
     at = select_time(source, 2)
     with pytest.raises(ValueError, match="sequence a: expected frame 1 next, got 2"):
-        writer.write(2, at.frames, at.reference, valid=at.valid)
-    cut = dataclasses.replace(at.frames, cut=np.asarray(True))
+        writer.write(2, at)
+    cut = dataclasses.replace(at, frames=dataclasses.replace(at.frames, cut=np.asarray(True)))
     with pytest.raises(ValueError, match="frame 2: channels changes from"):
-        writer.write(2, cut, at.reference)
-    writer.write(2, cut, at.reference, valid=at.valid)
+        writer.write(2, dataclasses.replace(cut, valid=None))
+    writer.write(2, cut)
     assert writer.finish().numbers == (0, 2)
 
 
@@ -275,22 +273,25 @@ def test_all_frames_of_a_sequence_have_an_exposure_or_none(tmp_path):
 def test_invalid_content_is_refused_with_names(tmp_path):
     at = select_time(sequence(), 0)
     writer = SequenceWriter(tmp_path, "a")
+    write = lambda reference, **frame: writer.write(  # noqa: E731
+        7, dataclasses.replace(at, frames=dataclasses.replace(at.frames, **frame), reference=reference)
+    )
     motion = at.frames.motion.copy()
     motion[2, 3, 0] = np.nan
     with pytest.raises(ValueError, match=r"sequence a, frame 7, channel motion: expected finite values, got nan"):
-        writer.write(7, dataclasses.replace(at.frames, motion=motion), at.reference)
+        write(at.reference, motion=motion)
     with pytest.raises(ValueError, match=r"sequence a, reference: expected \[s\*6, s\*9, 3\] with a whole s"):
-        writer.write(7, at.frames, at.reference[:, :-1])
+        write(at.reference[:, :-1])
     with pytest.raises(ValueError, match=r"sequence a, frame 7, reference: expected finite radiance >= 0, got -1\."):
-        writer.write(7, at.frames, at.reference - 1.0 - at.reference)
+        write(at.reference - 1.0 - at.reference)
     for bad in (np.inf, np.nan):
         reference = at.reference.copy()
         reference[0, 1, 2] = bad
         match = rf"frame 7, reference: expected finite radiance >= 0, got {bad}\. 1 of {reference.size} values are"
         with pytest.raises(ValueError, match=match):
-            writer.write(7, at.frames, reference)
+            write(reference)
     with pytest.raises(ValueError, match="frame 7 needs the buffers color"):
-        writer.write(7, dataclasses.replace(at.frames, color=None), at.reference)
+        write(at.reference, color=None)
     with pytest.raises(ValueError, match="expected at least one frame before finish"):
         writer.finish()
     with pytest.raises(ValueError, match="expected a plain folder name, got 'a/b'"):

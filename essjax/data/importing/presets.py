@@ -282,8 +282,7 @@ def _first_frame(opened: OpenClip, skip_broken: bool) -> SequenceInfo:
     reasons = []
     for number in clip.numbers:
         try:
-            converted = clip.convert(number)
-            return writer.describe(number, converted.frame, converted.reference)
+            return writer.describe(number, clip.convert(number).content)
         except ValueError as error:
             reasons.append(f"sequence {clip.name}, frame {number}: {error}")
             if not skip_broken:

@@ -13,7 +13,7 @@ import numpy as np
 
 from essjax.data.layout import SequenceInfo
 from essjax.data.store import DISAGREES, PreparedFrame, SequenceWriter
-from essjax.frames import Frame
+from essjax.frames import Frame, Sequence
 
 SAVE_EVERY = 16
 """Frames between two writes of ``sequence.json``: what a killed import loses at most."""
@@ -35,6 +35,11 @@ class Converted(NamedTuple):
     frame: Frame
     reference: np.ndarray
     counts: Mapping[str, int]
+
+    @property
+    def content(self) -> Sequence:
+        """As it is written: without a time axis."""
+        return Sequence(frames=self.frame, reference=self.reference)
 
 
 class Clip(Protocol):
@@ -197,8 +202,7 @@ def hint(opened: OpenClip, broken: int) -> str:
         return SKIP
     for number in (others[0], others[-1]):
         try:
-            frame = clip.convert(number)
-            writer.describe(number, frame.frame, frame.reference)
+            writer.describe(number, clip.convert(number).content)
             return SKIP
         except ValueError:
             continue
@@ -233,12 +237,12 @@ def _prepared(opened: OpenClip, workers: int) -> Generator[tuple[int, Future[Pre
     def work(number: int) -> PreparedFrame:
         before = made_from(clip, number)  # a file that changes while it is read counts as changed
         try:
-            frame, reference, counts = clip.convert(number)
-            writer.describe(number, frame, reference)
+            converted = clip.convert(number)
+            writer.describe(number, converted.content)
         except ValueError as error:
             raise BrokenFrame(str(error), before) from error
         try:
-            return writer.prepare(number, frame, reference, notes=counts, made_from=before)
+            return writer.prepare(number, converted.content, notes=converted.counts, made_from=before)
         except BaseException:
             writer.discard(number)
             raise
