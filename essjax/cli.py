@@ -16,6 +16,8 @@ from rich.table import Table
 from essjax.builtin import generate, plan
 from essjax.data import Dataset, ImportReport, import_dataset
 from essjax.data.check import CheckReport, check_dataset
+from essjax.data.guess import guess_recipe, to_toml
+from essjax.data.importing.draft import CERTAIN, LIKELY, UNKNOWN
 from essjax.data.layout import read_dataset, write_json
 from essjax.scenes import Rendering
 
@@ -168,6 +170,8 @@ def import_(
     name: str = "",
     skip_broken: bool = False,
     repair: bool = False,
+    guess: bool = False,
+    yes: bool = False,
 ) -> None:
     """Import rendered frames into a dataset, converting their conventions. Interrupted, the same command resumes; a
     clip that has grown, or another clip, is added to the dataset.
@@ -188,7 +192,15 @@ def import_(
       name: Name of the sequence; as in the dump if empty.
       skip_broken: Leave out broken and missing frames (the next one becomes a cut) instead of stopping at them.
       repair: Mend single NaN and infinite pixels from their neighbours, counted, instead of stopping at their frame.
+      guess: Find out what the dump is and write it to OUT.toml, with what is certain, likely and unknown.
+      yes: With --guess: import by what was found, too; nothing is imported otherwise.
     """
+    if guess:
+        preset, recipe = _guess(source, out)
+        if not yes:
+            chosen = f"--preset {preset}" + ("" if recipe is None else f" --recipe {recipe}")
+            _console.print(f"essjax import {source} {out} {chosen}", markup=False, soft_wrap=True)
+            return
     _check_folder(out, "OUT")
     given = {"train": train, "validation": validation, "test": test}
     splits = {split: parse_split(text, f"--{split}") for split, text in given.items() if text}
@@ -206,6 +218,36 @@ def import_(
             on_frame=progress,
         )
     _print_report(report)
+
+
+SURE_STYLES = {CERTAIN: "green", LIKELY: "cyan", UNKNOWN: "bold yellow"}
+
+
+def _guess(source: Path, out: Path) -> tuple[str, Path | None]:
+    """Write and print what a dump seems to be; its preset and recipe."""
+    path = out.with_name(f"{out.name}.toml")
+    if path.exists():
+        raise ValueError(
+            f"{path}: it is there already. Import with it (--recipe {path}), or delete it and guess again."
+        )
+    if not source.is_dir():
+        raise ValueError(f"{source}: expected the dump's folder.")
+    with _console.status("trying conventions on the pictures"):
+        found = guess_recipe(source)
+    table = Table(title=f"{source}: {found.preset}", title_justify="left")
+    for column in ("key", "value", "sure", "because"):
+        table.add_column(column)
+    for name, (sure, why) in found.notes.items():
+        group, _, key = name.partition(".")
+        value = found.content.get(group, {}).get(key, "") if key else found.preset
+        table.add_row(escape(name), escape(str(value)), f"[{SURE_STYLES[sure]}]{sure}[/]", escape(why))
+    _console.print(table)
+    if found.preset != "generic":
+        return found.preset, None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(to_toml(found.content, found.notes), encoding="utf-8")
+    _console.print(f"wrote {path}: look at what is unknown, then:", markup=False, soft_wrap=True)
+    return found.preset, path
 
 
 VERDICT_STYLES = {"ok": "green", "not decidable": "cyan", "warning": "yellow", "wrong": "bold red"}

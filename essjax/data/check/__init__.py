@@ -13,6 +13,7 @@ from essjax.data.check.jitter import FIXES, JitterCheck, judge_against, judge_be
 from essjax.data.check.motion import MotionCheck, judge_motion, look
 from essjax.data.check.pairs import Step, choose, read_step, steps
 from essjax.data.check.pictures import write_pictures
+from essjax.data.check.surfaces import SurfaceCheck, judge_surfaces, proved
 from essjax.data.check.values import ValuesCheck, judge_values
 from essjax.data.layout import Dataset, SequenceInfo
 
@@ -55,7 +56,7 @@ class _Checks:
 
     def __init__(self):
         self.values, self.geometry, self.jitter = ValuesCheck(), GeometryCheck(), JitterCheck()
-        self.motion, self.continuity = MotionCheck(), ContinuityCheck()
+        self.motion, self.surfaces, self.continuity = MotionCheck(), SurfaceCheck(), ContinuityCheck()
         self.shown: int | None = None
 
     def add(self, step: Step) -> None:
@@ -68,6 +69,7 @@ class _Checks:
         if not self.continuity.add(step, looked):
             return
         self.motion.add(step, looked)
+        self.surfaces.add(step, looked.motions)
         self.jitter.add_pair(step, looked)
         self.geometry.add_pair(step, looked)
         self.shown = step.number
@@ -78,12 +80,16 @@ def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
     own = info.source.get("reference") == "color"
     against, shift = judge_against(jitter, info.scale, own_reference=own)
     references_jittered = own or against.fix == FIXES["none"]
-    motion = judge_motion([check.motion for check in checks], info, references_jittered=references_jittered)
+    surfaces = [check.surfaces for check in checks]
+    motion = judge_motion(
+        [check.motion for check in checks], info, references_jittered=references_jittered, proved=proved(surfaces)
+    )
     motion_wrong = any(finding.verdict == "wrong" for finding in motion)
     return [
         *motion,
+        judge_surfaces(surfaces, wrong="motion" if motion_wrong else "jitter" if against.verdict == "wrong" else ""),
         against,
-        judge_between(jitter, motion_wrong=motion_wrong),
+        judge_between(jitter, motion_wrong=motion_wrong, against=against),
         shift,
         *judge_geometry([check.geometry for check in checks], motion_wrong=motion_wrong),
         *judge_values([check.values for check in checks]),

@@ -16,6 +16,8 @@ DUPLICATE = 1e-4
 CUT = 0.5
 """Correlation of the best warp with the frame: below it nothing is seen again. Measured 0.8 and more within shots, 0.3
 and less across cuts."""
+MOSTLY = 0.5
+"""Share of the picture that objects fill which move by themselves."""
 NO_CUT = 0.8
 """Correlation above which a marked cut is none."""
 
@@ -47,9 +49,16 @@ class ContinuityCheck:
             self.duplicates.append(step.where)
         if same_reference:
             self.duplicate_references.append(step.where)
-        if looked.similarity < CUT:
+        cut = looked.similarity < CUT and not _moves_by_itself(step)
+        if cut:
             self.unmarked.append(step.where)
-        return not (same or same_reference or looked.similarity < CUT)
+        return not (same or same_reference or cut)
+
+
+def _moves_by_itself(step: Step) -> bool:
+    """Whether objects that move by themselves fill most of the picture: then wrong motion looks like a cut."""
+    ids = step.now.gbuffers.stencil
+    return ids is not None and float((np.asarray(ids) > 0).mean()) > MOSTLY
 
 
 def _same(before, now, key: float) -> bool:

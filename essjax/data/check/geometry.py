@@ -8,6 +8,7 @@ import numpy as np
 from essjax.cameras import Camera, camera_rays, pixel_positions
 from essjax.data.check.finding import Finding
 from essjax.data.check.motion import Look, rendered_errors
+from essjax.data.check.normals import NormalCheck, judge_directions
 from essjax.data.check.pairs import Step
 from essjax.data.check.readings import camera_motion, jitter_step
 
@@ -38,11 +39,13 @@ class GeometryCheck:
       counts: pixels by what was found, see the functions that count.
       distances: one record per frame that has cameras and world positions, see ``compare_distances``.
       has_stencil: whether moving objects are marked.
+      normals: their directions against the surfaces.
     """
 
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
     distances: list[dict[str, float]] = dataclasses.field(default_factory=list)
     has_stencil: bool = False
+    normals: NormalCheck = dataclasses.field(default_factory=NormalCheck)
 
     def _count(self, found: Mapping[str, np.ndarray | int]) -> None:
         for name, where in found.items():
@@ -58,6 +61,7 @@ class GeometryCheck:
             self.distances += [found] if found else []
         if gbuffers.normal is not None:
             self._count(normal_defects(np.asarray(gbuffers.normal), camera))
+            self.normals.add(step)
 
     def add_pair(self, step: Step, looked: Look) -> None:
         """Look at what hides what in the frame before, and at motion against cameras."""
@@ -249,7 +253,7 @@ def _judge_cameras(checks: Sequence[GeometryCheck], depth: Finding, motion_wrong
     return Finding(ROWS[1], "wrong" if marked and agreeing < HALF else "warning", found, fix, numbers)
 
 
-def _judge_normals(checks: Sequence[GeometryCheck]) -> Finding:
+def _judge_normals(checks: Sequence[GeometryCheck], depth: Finding) -> Finding:
     there, off, seen = (_sum(checks, name) for name in ("normals", "off length", "seen"))
     if not there:
         return Finding(ROWS[2], "not decidable", "there are none")
@@ -263,6 +267,9 @@ def _judge_normals(checks: Sequence[GeometryCheck]) -> Finding:
             else "divide them by their length at import"
         )
         return Finding(ROWS[2], "wrong", found, fix, numbers)
+    directions = None if depth.verdict == "wrong" else judge_directions([check.normals for check in checks])
+    if directions is not None:
+        return directions
     away = _sum(checks, "faces away")
     if seen and away > 0.2 * seen:
         found = f"{away / seen:.0%} look away from the camera"
@@ -274,4 +281,4 @@ def _judge_normals(checks: Sequence[GeometryCheck]) -> Finding:
 def judge_geometry(checks: Sequence[GeometryCheck], *, motion_wrong: bool) -> list[Finding]:
     """Findings about depth, cameras and normals."""
     depth = _judge_depth(checks, motion_wrong)
-    return [depth, _judge_cameras(checks, depth, motion_wrong), _judge_normals(checks)]
+    return [depth, _judge_cameras(checks, depth, motion_wrong), _judge_normals(checks, depth)]

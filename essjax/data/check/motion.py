@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.data.check.compare import DIFFERENT, Comparison, judge
+from essjax.data.check.compare import DIFFERENT, MARGIN, Comparison, judge, total
 from essjax.data.check.finding import Finding
 from essjax.data.check.pairs import Step
 from essjax.data.check.readings import JITTERED, NONE, READINGS, fix_of, jitter_step, motions_of
+from essjax.data.check.surfaces import guide_errors, interior, lands_inside, regions_of
 from essjax.data.layout import SequenceInfo
 from essjax.typing import Array, Color, Image, Jitter, Motion
 from essjax.warp import backward_warp, hole_mask, inside_mask, upsample_motion
@@ -106,22 +107,29 @@ class MotionCheck:
 
     reference: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
     rendered: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
+    guided: Comparison = dataclasses.field(default_factory=lambda: Comparison(READINGS))
     squares: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
     pixels: int = 0
 
     def add(self, step: Step, looked: Look) -> None:
         """Add a pair that is not a cut."""
         assert step.before is not None
-        self.reference.add(looked.reference, looked.motions, looked.usable)
+        lookups, regions = looked.motions + jitter_step(step), regions_of(step)
+        known = looked.usable.any(axis=(1, 2))
+        usable = looked.usable & interior(step.now.gbuffers)
+        usable &= lands_inside(step, lookups)
+        self.reference.add(looked.reference, looked.motions, usable, regions)
         valid = unoccluded(step) & looked.usable[0]
         self.squares += [looked.squares[0][valid].sum(), looked.squares[NONE][valid].sum()]
         self.pixels += int(valid.sum())
-        lookups, usable = looked.motions + jitter_step(step), looked.usable.copy()
         usable[[READINGS.index(name) for name in JITTERED]] = False
         errors = np.zeros(usable.shape, np.float32)
-        for index in np.flatnonzero(usable.any(axis=(1, 2))):
+        for index in np.flatnonzero(known):
             errors[index] = rendered_errors(step, lookups[index])
-        self.rendered.add(errors, lookups, usable)
+        self.rendered.add(errors, lookups, usable, regions)
+        guided = guide_errors(step, lookups, known)
+        if guided is not None:
+            self.guided.add(guided, lookups, usable, regions)
 
     @property
     def psnr(self) -> tuple[float, float]:
@@ -137,8 +145,31 @@ def rendered_errors(step: Step, lookup: np.ndarray) -> np.ndarray:
     return np.asarray(warp_errors(step.before.color, step.now.color, lookup, zero, step.key, scale=1))[..., 0]
 
 
+def right_reading(checks: Sequence[MotionCheck], proved: int | None) -> tuple[int | None, str]:
+    """The reading that is right, if something knows it that does not lie, and what that is.
+
+    Cameras and depth prove a convention on what stands still, and a convention is one for the whole picture; else base
+    colour and normals, which move with the surfaces, may.
+    """
+    if proved is not None:
+        return proved, "cameras and depth say so of what stands still"
+    guided = total(check.guided for check in checks)
+    best = guided.best()
+    if best and guided.supported(best):
+        return best, f"base colour and normals follow it better than what is stated, by {guided.margin(best, 0):.1f} dB"
+    closest = guided.rivals()[:1]
+    if not best and closest and guided.margin(0, closest[0]) >= MARGIN and guided.decidable(0, NONE):
+        gain = guided.margin(0, closest[0])
+        return 0, f"base colour and normals follow the motion, the next reading is {gain:.1f} dB behind"
+    return None, ""
+
+
 def judge_motion(
-    checks: Sequence[MotionCheck], info: SequenceInfo, *, references_jittered: bool = False
+    checks: Sequence[MotionCheck],
+    info: SequenceInfo,
+    *,
+    references_jittered: bool = False,
+    proved: int | None = None,
 ) -> list[Finding]:
     """Findings about motion: against the references, and against the rendered frames.
 
@@ -146,11 +177,21 @@ def judge_motion(
       checks: one per sequence.
       info: of the dataset.
       references_jittered: they look as jittered as the frames, so they cannot tell whether jitter is in the motion.
+      proved: the reading that the cameras prove, see ``surfaces.proved``.
     """
     fixes = {name: fix_of(name, info) for name in READINGS}
     still = f"the motion is < {DIFFERENT} px, or nothing is seen twice"
-    against = judge(ROWS[0], [check.reference for check in checks], fixes, still, ignore=JITTERED)
-    rendered = judge(ROWS[1], [check.rendered for check in checks], fixes, still)
+    right, proof = right_reading(checks, proved)
+    known = {"right": right, "proof": proof}
+    references = [check.reference for check in checks]
+    of_jitter = total(references).best() in [READINGS.index(name) for name in JITTERED]
+    if of_jitter and proved is None and right == 0:  # which base colour of jittered frames cannot tell
+        known = {}
+    against = judge(ROWS[0], references, fixes, still, ignore=JITTERED, **known)
+    rendered = judge(ROWS[1], [check.rendered for check in checks], fixes, still, **known)
+    if rendered.verdict == "wrong" and against.verdict in ("ok", "wrong") and rendered.fix != against.fix:
+        found = "the references, which are cleaner, say otherwise"
+        rendered = dataclasses.replace(rendered, verdict="not decidable", found=found, fix="")
     pixels = sum(check.pixels for check in checks)
     merged = MotionCheck(squares=np.sum([check.squares for check in checks], axis=0), pixels=pixels)
     if references_jittered and against.fix in [fixes[name] for name in JITTERED]:

@@ -14,9 +14,17 @@ from essjax.data.layout import SUFFIXES
 TOLERANCE = 1e-3
 """By which a value may leave its range: half precision."""
 VARIES = ("reference", *(name for name, buffer in BUFFERS.items() if buffer.varies))
-CLIPPED = {1.0: 1e-4, 255.0: 1e-4, HALF_MAX: 1e-2}
+CLIPPED = {1.0: 1e-3, 255.0: 1e-3, HALF_MAX: 1e-2}
 """Largest values that display-referred pictures and half-precision files have -> share of values that is too much: a
 few at the end of half are a sun or a lamp."""
+
+
+BEYOND = 4
+"""Pictures that motion may be long: nothing is seen that came from farther."""
+HALF_STEP = 2.0**-11
+"""Relative error of half precision."""
+BITS = 0.99
+"""Share of the values that 8 bits can hold in pictures that were of 8 bits."""
 
 
 def channels_of(image: str, count: int) -> list[str]:
@@ -33,6 +41,8 @@ class ValuesCheck:
       low: channel -> smallest finite value.
       high: channel -> largest finite value.
       at_top: image -> values of colour and reference that are in ``CLIPPED``.
+      eighths: image -> values that 8 bits can hold: k / 255.
+      wholes: image -> values that are whole numbers.
       pixels: image -> how many values there are.
     """
 
@@ -40,6 +50,8 @@ class ValuesCheck:
     low: dict[str, float] = dataclasses.field(default_factory=dict)
     high: dict[str, float] = dataclasses.field(default_factory=dict)
     at_top: dict[str, int] = dataclasses.field(default_factory=dict)
+    eighths: dict[str, int] = dataclasses.field(default_factory=dict)
+    wholes: dict[str, int] = dataclasses.field(default_factory=dict)
     pixels: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def add(self, step: Step) -> None:
@@ -56,6 +68,7 @@ class ValuesCheck:
             "NaN": np.isnan(plane).any(),
             "infinite": infinite,
             "negative": image in ("color", "reference") and low < 0,
+            "beyond the picture": image == "motion" and max(-low, high) > BEYOND * max(plane.shape),
             "out of [0, 1]": image in UNIT_RANGE and (low < -TOLERANCE or high > 1 + TOLERANCE),
         }
         for kind, found in defects.items():
@@ -69,12 +82,17 @@ class ValuesCheck:
         if image in ("color", "reference"):
             self.at_top[image] = self.at_top.get(image, 0) + int(np.isin(finite, list(CLIPPED)).sum())
             self.pixels[image] = self.pixels.get(image, 0) + plane.size
+            bits = np.abs(255 * finite - np.rint(255 * finite)) < 0.01 + 255 * finite * HALF_STEP
+            self.eighths[image] = self.eighths.get(image, 0) + int((bits & (finite <= 1)).sum())
+            self.wholes[image] = self.wholes.get(image, 0) + int((finite == np.rint(finite)).sum())
 
 
 _FIXES = {
     "NaN": "find what makes them in the renderer, or set them to 0 at import and mark the pixels as reactive",
     "infinite": "clamp radiance at import (half holds 65504); only the background's depth is +inf",
     "negative": "clamp at 0 at import: filters with negative lobes and denoisers make them",
+    "beyond the picture": "is motion in another unit (recipe: unit in [motion]), or is it garbage where nobody wrote "
+    "any (recipe: unwritten in [motion], written in [channels])?",
     "out of [0, 1]": "is the channel in [0, 255], or another one? Scale or clamp it at import",
 }
 
@@ -116,6 +134,19 @@ def _judge_constant(checks: Sequence[ValuesCheck]) -> Finding:
 def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
     check, extremes = "colour scale", _extremes(checks)
     for image in ("color", "reference"):
+        total = max(sum(c.pixels[image] for c in checks), 1)
+        top = max(extremes[channel][1] for channel in channels_of(image, 3))
+        lit = top > 0 and max(extremes[channel][0] for channel in channels_of(image, 3)) < top
+        if lit and top <= 1 and sum(c.eighths[image] for c in checks) > BITS * total:
+            found = f"{image} holds 256 different values, k / 255: pictures of 8 bits, taken as linear"
+            fix = "8 bits are as good as always sRGB: say so at import (recipe: encoding 'srgb' in [color])"
+            return Finding(check, "warning", found, fix, {"max": top})
+        if lit and 1 < top <= 255 and sum(c.wholes[image] for c in checks) > BITS * total:
+            found = f"{image} holds whole numbers up to {top:g}: bytes, taken as radiance"
+            fix = (
+                "scale them by 1/255, and decode sRGB, at import (recipe: color in [scale], encoding 'srgb' in [color])"
+            )
+            return Finding(check, "warning", found, fix, {"max": top})
         high = max(extremes[channel][1] for channel in channels_of(image, 3))
         share = sum(c.at_top[image] for c in checks) / sum(c.pixels[image] for c in checks)
         if high in CLIPPED and share > CLIPPED[high]:

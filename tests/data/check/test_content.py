@@ -1,5 +1,6 @@
 """Depth, cameras, normals, values, duplicates and cuts: each defect is named, with its fix."""
 
+import dataclasses
 import json
 import shutil
 
@@ -53,8 +54,9 @@ def test_normals(copy):
     edit(copy, lambda planes, number: half(planes))
     assert_wrong(copy, "normals", "normals are encoded in [0, 1]: n = 2 v - 1")
     edit(copy, lambda planes, number: {name: np.float16(1 - 2 * planes[name]) for name in half(planes)})
-    finding = rows(copy)["normals"]
-    assert finding.verdict == "warning" and "look away from the camera" in finding.found
+    assert_wrong(copy, "normals", "normals point into the surfaces: negate them")
+    edit_records(copy, lambda record, number: record.update(camera=None))
+    assert rows(copy)["normals"].verdict == "ok"  # no cameras: nothing says where the surfaces face
 
 
 def values(folder):
@@ -121,3 +123,30 @@ def test_cuts(copy):
     finding = rows(copy)["cuts"]
     assert finding.verdict == "wrong" and f"not marked as cuts: {NAME} 3" in finding.found
     assert '"cut": true' in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict", "fix"),
+    [
+        (lambda color: np.rint(np.clip(color, 0, 1) * 255) / 255, "warning", "encoding 'srgb' in [color]"),
+        (lambda color: np.rint(np.clip(color, 0, 1) * 255), "warning", "color in [scale]"),
+        (lambda color: np.float16((np.rint(np.clip(color, 0, 0.9) * 255) / 255) ** 2.2), "ok", ""),
+    ],
+)
+def test_pictures_of_8_bits_that_were_taken_as_linear(good, change, verdict, fix):
+    check = ValuesCheck()
+    for step in steps(read_dataset(good), NAME, 1):
+        check.add(dataclasses.replace(step, raw={**step.raw, "color": change(step.raw["color"])}))
+    finding = judge_values([check])[2]
+    assert finding.verdict == verdict and fix in finding.fix
+
+
+def test_motion_that_is_longer_than_anything_can_be(good):
+    check = ValuesCheck()
+    for step in steps(read_dataset(good), NAME, 1):
+        motion = step.raw["motion"].copy()
+        motion[0, 0, 0] = -1e6
+        check.add(dataclasses.replace(step, raw={**step.raw, "motion": motion}))
+    finding = judge_values([check])[0]
+    assert finding.verdict == "wrong" and "beyond the picture: motion.X" in finding.found
+    assert "unit in [motion]" in finding.fix and "unwritten in [motion]" in finding.fix

@@ -1,0 +1,98 @@
+"""``python -m tools.verdicts``: what ``essjax check`` says of unusual clips, right and broken, as a Markdown table."""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from essjax.data import Dataset, read_dataset, read_sequence, write_dataset, write_sequence
+from essjax.data.check import check_dataset
+from essjax.data.check.finding import Finding
+from tools.verdicts.clips import CLIPS, render
+from tools.verdicts.corruptions import CORRUPTIONS, Corruption
+
+RIGHT, SILENT, MISSED, MISLED = "named", "not decidable", "missed", "misled"
+"""Outcomes: the right fix alone; nothing to see, and nothing said; nothing said; another fix, too."""
+PAGE = Path(__file__).parent / "RESULTS.md"
+
+
+def wrongs(dataset: Dataset) -> list[Finding]:
+    """Findings that say "wrong"."""
+    return [finding for finding in check_dataset(dataset, pairs=0).findings if finding.verdict == "wrong"]
+
+
+def outcome(dataset: Dataset, corruption: Corruption, folder: Path) -> tuple[str, list[Finding]]:
+    """Break a clip, check it, and compare what is said with what had to be."""
+    good = read_sequence(dataset, "clip")
+    broken = corruption.apply(good)
+    write_sequence(folder, "clip", broken)
+    found = wrongs(write_dataset(folder, {"test": ["clip"]}))
+    if not corruption.visible(good, broken):
+        return (MISLED if found else SILENT), found
+    right = [finding for finding in found if any(fix in finding.fix for fix in corruption.fixes)]
+    if not right:
+        return (MISLED if found else MISSED), found
+    return (RIGHT if len(right) == len(found) else MISLED), found
+
+
+def main() -> None:
+    """Render what is not there, check everything, write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--clips", type=Path, help="folder to keep the rendered clips in")
+    parser.add_argument(
+        "--only", default="", help="clips and corruptions whose names contain this, separated by commas"
+    )
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        root = arguments.clips or Path(temporary) / "clips"
+        only = [word for word in arguments.only.split(",") if word]
+        named = lambda name, all_names: not any(w in n for w in only for n in all_names) or any(w in name for w in only)
+        clips = [name for name in CLIPS if named(name, CLIPS)]
+        corruptions = [name for name in CORRUPTIONS if named(name, CORRUPTIONS)]
+        table, alarms, details = {}, {}, []
+        for clip in clips:
+            folder = root / clip.replace(" ", "-")
+            dataset = read_dataset(folder) if (folder / "dataset.json").exists() else render(clip, folder)
+            alarms[clip] = wrongs(dataset)
+            details += [f"- {clip}, as it is: {f.check}: {f.found}. {f.fix}" for f in alarms[clip]]
+            for name in corruptions:
+                verdict, found = outcome(
+                    dataset, CORRUPTIONS[name], Path(temporary) / f"{clip}-{name}".replace("/", "-")
+                )
+                table[clip, name] = verdict
+                print(f"{clip}, {name}: {verdict}", flush=True)
+                if verdict in (MISSED, MISLED):
+                    details += [f"- {clip}, {name}: {verdict}: {f.check}: {f.found}. {f.fix}" for f in found]
+                    details += [] if found else [f"- {clip}, {name}: {verdict}"]
+    text = page(clips, corruptions, table, alarms, details)
+    print(text)
+    if not only:
+        PAGE.write_text(text, encoding="utf-8")
+
+
+def page(clips, corruptions, table, alarms, details) -> str:
+    """The results as Markdown."""
+    visible = [v for v in table.values() if v != SILENT]
+    named = visible.count(RIGHT)
+    lines = [
+        "# What `essjax check` says of unusual clips",
+        "",
+        "Made by `python -m tools.verdicts`; the clips are in `clips.py`, the corruptions in `corruptions.py`.",
+        "*named*: the right fix was told, and no other; *not decidable*: the corruption changes nothing that pictures",
+        "could show, and nothing is called wrong; *missed*: nothing is called wrong; *misled*: something else is.",
+        "",
+        f"False alarms on the {len(clips)} clips as they are: **{sum(map(bool, alarms.values()))}**.",
+        f"Named with the right fix: **{named} of {len(visible)}** ({named / max(len(visible), 1):.1%});",
+        f"misled: {visible.count(MISLED)}, missed: {visible.count(MISSED)}.",
+        "",
+        "| corruption | " + " | ".join(clips) + " |",
+        "|---|" + "---|" * len(clips),
+        "| none | " + " | ".join("**wrong**" if alarms[clip] else "ok" for clip in clips) + " |",
+        *[f"| {name} | " + " | ".join(table[clip, name] for clip in clips) + " |" for name in corruptions],
+        "",
+        *(["What was not as it should be:", "", *details, ""] if details else []),
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
