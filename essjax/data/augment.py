@@ -41,7 +41,7 @@ def _stays_inside(frame: Frame) -> np.ndarray:
 
 
 def start_with_cut(sequence: Sequence) -> Sequence:
-    """The sequence as if nothing had come before it: frame 0 is a cut, and all of it a hole unless it already was one.
+    """Let the sequence begin as if nothing came before: frame 0 is a cut, and a hole unless it already was a cut.
 
     Args:
       sequence: NumPy leaves ``[T, ..., H, W, C]``; not changed.
@@ -61,7 +61,7 @@ def start_with_cut(sequence: Sequence) -> Sequence:
 
 
 def crop_images(sequence: Sequence, top: int, left: int, height: int, width: int) -> Sequence:
-    """The first half of ``crop``: only the images, as views; for ``crop_origin`` to finish.
+    """Do the first half of ``crop``: only the images, as views; for ``crop_origin`` to finish.
 
     Args:
       sequence: NumPy leaves ``[H, W, C]``, or with a time axis; native frames are dropped.
@@ -88,7 +88,7 @@ def crop_images(sequence: Sequence, top: int, left: int, height: int, width: int
 
 
 def crop_origin(sequence: Sequence, top: int, left: int) -> Sequence:
-    """The second half of ``crop``: principal point and ``valid`` of the images that ``crop_images`` cut out."""
+    """Do the second half of ``crop``: principal point and ``valid`` of the images that ``crop_images`` cut out."""
     frames, valid = sequence.frames, sequence.valid
     if frames.camera is not None:
         center = frames.camera.center - np.asarray([left, top], np.float32)

@@ -44,7 +44,7 @@ def atomic(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def layer(channel: str) -> str:
-    """``"normal"`` of ``"normal.X"``; a channel without a dot is its own layer."""
+    """Name the layer of a channel, ``"normal"`` of ``"normal.X"``; one without a dot is its own layer."""
     return channel.rpartition(".")[0] or channel
 
 
@@ -61,7 +61,7 @@ def _check_file(path: Path) -> None:
 
 
 def _open(path: Path, *, header_only: bool) -> list[OpenEXR.Part]:
-    """The parts of a file. Their attributes are read here, while a copy of the file may be needed for them."""
+    """Open the parts of a file. Their attributes are read here, while a copy of the file may be needed for them."""
     try:
         return _parts(path, header_only)
     except UnicodeDecodeError:
@@ -93,7 +93,7 @@ def _closest(names: Iterable[str], wanted: Iterable[str]) -> str:
 
 
 class _Part(NamedTuple):
-    """What the header says of a part."""
+    """A part as the header describes it."""
 
     name: str
     channels: tuple[str, ...]
@@ -181,7 +181,7 @@ def _full_names(parts: list[_Part]) -> list[dict[str, str]]:
 
 
 def _planes(names: Mapping[str, str], described: _Part, part: OpenEXR.Part) -> dict[str, np.ndarray]:
-    """The channels of a part that could be read, cropped to the image."""
+    """Gather the channels of a part that could be read, cropped to the image."""
     planes = {names[name]: channel.pixels for name, channel in part.channels.items() if name in names}
     return {
         name: np.ascontiguousarray(plane[described.inside])
@@ -231,7 +231,7 @@ def read(path: str | os.PathLike, expect: Iterable[str] = ()) -> dict[str, np.nd
 
 
 def _encode(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, int]:
-    """The array as it is stored, and how many values had to be clamped to half's range."""
+    """Encode the array as it is stored, and count the values that had to be clamped to half's range."""
     if values.ndim != 2 or not values.size:
         raise ValueError(f"{path}, channel {name}: expected one [H, W] plane, got shape {values.shape}.")
     if values.dtype == bool or np.issubdtype(values.dtype, np.integer):

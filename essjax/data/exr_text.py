@@ -37,7 +37,7 @@ def _is_utf8(text: bytes) -> bool:
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """A copy of a file in which letters that are no UTF-8 are question marks, in values of text alone.
+    """Copy a file with question marks for letters that are no UTF-8, in values of text alone.
 
     Raises:
       ValueError: another attribute is no UTF-8; names it.

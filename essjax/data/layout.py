@@ -241,7 +241,7 @@ def _check_segment(path: Path, split: str, segment: Segment, sequences: Mapping[
 
 
 def check_agreement(path: Path, infos: Iterable[SequenceInfo]) -> None:
-    """A ValueError unless the sequences may be of one dataset: one size, scale, and set of channels."""
+    """Raise a ValueError unless the sequences may be of one dataset: one size, scale, and set of channels."""
     infos = list(infos)
     for info in infos:
         for field in AGREE:

@@ -24,7 +24,7 @@ class Source(Protocol):
     """Anything with a length that gives ``Sequence``s by index, NumPy leaves ``[T, H, W, C]``: a list will do."""
 
     def __len__(self) -> int:
-        """Number of sequences."""
+        """Return the number of sequences."""
         ...
 
     def __getitem__(self, index: int) -> Sequence:
@@ -94,7 +94,7 @@ class DiskSource:
         return info.height, info.width, optional
 
     def window(self, index: int, start: int, length: int, box: tuple[int, int, int, int] | None = None) -> Sequence:
-        """What slicing sequence ``index`` in time, then ``crop``, gives, bit by bit; only these frames are read.
+        """Return what slicing sequence ``index`` in time, then ``crop``, gives, bit by bit; only these frames are read.
 
         Args:
           index: of the sequence.
@@ -127,7 +127,7 @@ class DiskSource:
 def disk_source(
     dataset: Dataset, split: str, *, native: bool = False, ranges: bool = False, memory: int | None = None
 ) -> DiskSource:
-    """The segments of a split, read when first used; ``dataset.segments(split)`` says which frames are scored.
+    """Offer the segments of a split, read when first used; ``dataset.segments(split)`` says which frames are scored.
 
     Args:
       dataset: from ``read_dataset``.
@@ -200,7 +200,7 @@ def _cut_out(source: Source, index: int, start: int, length: int, box: tuple[int
 
 
 class View(NamedTuple):
-    """What a clip shows of each frame of a sequence.
+    """The part of each frame of a sequence that a clip shows.
 
     Attributes:
       box: top, left, height and width in LR pixels, or None for whole frames.
@@ -214,7 +214,7 @@ class View(NamedTuple):
 def draw_view(
     source: Source, index: int, crop: tuple[int, int] | None, flips: bool, random: np.random.Generator
 ) -> View:
-    """A random view of sequence ``index``: ``crop`` (height, width) anywhere in its frames, mirrored or not."""
+    """Draw a view of sequence ``index``: ``crop`` (height, width) anywhere in its frames, mirrored or not."""
     height, width, _ = _outline(source, index)
     size = crop or (height, width)
     top, left = random.integers(0, height - size[0] + 1), random.integers(0, width - size[1] + 1)

@@ -1,4 +1,4 @@
-"""What is read stays in memory while there is room for it: a store bounded in bytes, and how much memory is free."""
+"""A store bounded in bytes: what is read stays in memory while there is room; and how much memory is free."""
 
 import threading
 from collections.abc import Callable, Hashable
@@ -14,7 +14,7 @@ UNKNOWN = 4 << 30
 
 
 def _number(path: Path, name: str = "") -> int:
-    """The number in a file, or that in its line ``name``."""
+    """Read the number in a file, or that in its line ``name``."""
     text = path.read_text()
     return int(dict(line.split() for line in text.splitlines())[name] if name else text)
 
@@ -71,12 +71,12 @@ class Kept:
         """Bytes of the values kept."""
 
     def find(self, key: Hashable) -> PyTree | None:
-        """The value of ``key``, or None if it is not kept."""
+        """Return the value of ``key``, or None if it is not kept."""
         with self._lock:
             return self._values.get(key)
 
     def get(self, key: Hashable, make: Callable[[], PyTree]) -> PyTree:
-        """The value of ``key``, kept or made; two threads that ask at the same time may both make it."""
+        """Return the value of ``key``, kept or made; two threads that ask at the same time may both make it."""
         value = self.find(key)
         if value is not None:
             return value

@@ -17,7 +17,7 @@ _NAMES = {0: "Y", 2: "RGB", 3: "RGB", 4: "YA", 6: "RGBA"}
 
 
 def _check(path: Path, content: bytes) -> int:
-    """The colour type; a ValueError unless every chunk is there and undamaged, which libpng does not promise."""
+    """Return the colour type; a ValueError unless all chunks are there and undamaged, which libpng does not promise."""
     if not content.startswith(_MAGIC):
         what = "an empty file" if not content else f"a file that begins with {content[:4]!r}"
         raise ValueError(f"{path}: expected a PNG file, found {what}. Download or render it again.")

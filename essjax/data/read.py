@@ -51,7 +51,7 @@ def _make_frame(images: Mapping[str, np.ndarray], record: Mapping, prefix: str =
 
 
 def select_records(info: SequenceInfo, first: int, last: int) -> list[Mapping]:
-    """The records of the frames from number ``first`` to ``last``, both included."""
+    """Select the records of the frames from number ``first`` to ``last``, both included."""
     return [record for record in info.frames if first <= record["number"] <= last]
 
 

@@ -1,4 +1,4 @@
-"""What ``sequence.json`` says about a frame, and how two such records are compared."""
+"""Records of frames in ``sequence.json``, and how two of them are compared."""
 
 import dataclasses
 import hashlib
@@ -32,7 +32,7 @@ def differences(asked: Mapping[str, Any], found: Mapping[str, Any], prefix: str 
 
 
 def digest(content: Any) -> str:
-    """Of all leaves of a tree of arrays: it tells a frame from another one."""
+    """Digest all leaves of a tree of arrays: it tells a frame from another one."""
     state = hashlib.blake2b(digest_size=8)
     for path, leaf in jax.tree_util.tree_leaves_with_path(content):
         state.update(f"{jax.tree_util.keystr(path)} {leaf.dtype} {leaf.shape}".encode())
@@ -47,7 +47,7 @@ def _camera_record(camera: Camera | None) -> dict | None:
 
 
 def frame_record(number: int, frame: Frame, native: Frame | None, made_from: str) -> dict:
-    """The entry of a frame in ``sequence.json``, but for its notes."""
+    """Make the entry of a frame in ``sequence.json``, but for its notes."""
     record = {
         "number": number,
         "made_from": made_from,

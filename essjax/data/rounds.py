@@ -38,7 +38,7 @@ class Rounds:
         return self
 
     def __next__(self) -> Sequence:
-        """The next batch; what making its round raised is raised here."""
+        """Return the next batch; what making its round raised is raised here."""
         if self._taken == self._batches:
             self._current = self._ahead().result()
             self._round, self._taken, self._next = self._round + 1, 0, None
@@ -49,7 +49,7 @@ class Rounds:
         return next(self._current)
 
     def _ahead(self) -> Future:
-        """The next round, in the making."""
+        """Start making the next round."""
         if self._next is None:
             self._next = self._worker.submit(self._make, self._round + 1)
         return self._next

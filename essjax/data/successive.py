@@ -52,7 +52,7 @@ def _shots(source: Source, length: int) -> list[_Shot]:
 
 
 class _Slot:
-    """What one slot of the batches shows; made as far as it was asked for, so that every place can be asked for."""
+    """One slot of the batches; made as far as it was asked for, so that every place can be asked for."""
 
     def __init__(self, shots: list[_Shot], draw, step: int, length: int, random: np.random.Generator):
         self._shots, self._draw, self._step, self._length = shots, draw, step, length
@@ -62,7 +62,7 @@ class _Slot:
         self._order: list[int] = []
 
     def __getitem__(self, number: int) -> tuple[_Visit, int]:
-        """The visit that shows window ``number`` of the slot, and which of that visit's windows it is."""
+        """Find the visit that shows window ``number`` of the slot, and which of that visit's windows it is."""
         with self._lock:
             while not self._ends or self._ends[-1] <= number:
                 self._extend()

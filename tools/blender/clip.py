@@ -1,4 +1,4 @@
-"""What render_essjax.py needs and Blender does not: jitter, camera shift, meta.json. Imports without bpy."""
+"""Parts of render_essjax.py that need no Blender: jitter, camera shift, meta.json. Imports without bpy."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ PERIOD = 16
 
 
 def halton(index: int, base: int) -> float:
-    """The radical inverse of ``index`` (>= 1) in ``base``."""
+    """Compute the radical inverse of ``index`` (>= 1) in ``base``."""
     result, fraction = 0.0, 1.0
     while index > 0:
         fraction /= base
@@ -70,7 +70,7 @@ def parse_frames(text: str) -> range:
 
 
 def positive(text: str) -> int:
-    """A whole number above 0, as an argument's type."""
+    """Parse a whole number above 0, as an argument's type."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text}")
@@ -78,14 +78,14 @@ def positive(text: str) -> int:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """The old file or the new one, never half of it."""
+    """Leave the old file or the new one, never half of it."""
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)
     os.replace(temporary, path)
 
 
 def open_meta(path: Path, size: tuple[int, int], scale: int, source: dict) -> dict:
-    """The contents of meta.json: those of an unfinished clip, or of a new one without frames.
+    """Read meta.json: that of an unfinished clip, or a new one without frames.
 
     Args:
       path: of meta.json.
@@ -116,7 +116,7 @@ def open_meta(path: Path, size: tuple[int, int], scale: int, source: dict) -> di
 
 
 def image_paths(folder: Path, frame: int) -> tuple[Path, Path]:
-    """Of the LR image and the reference."""
+    """Name the files of the LR image and the reference."""
     return folder / f"lr.{frame:04d}.exr", folder / f"hr.{frame:04d}.exr"
 
 

@@ -18,7 +18,7 @@ def _material(name, color, roughness=0.5, metallic=0.0):
 
 
 def _textured(name, kind, scale, first, second, output="Color"):
-    """A Principled material whose base colour is a procedural texture of the object's coordinates."""
+    """Make a Principled material whose base colour is a procedural texture of the object's coordinates."""
     material = _material(name, first)
     tree = material.node_tree
     coordinates, texture = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new(kind)

@@ -17,7 +17,7 @@ def _shader_inputs(node):
 
 
 def find_shader(tree, socket):
-    """The first Principled (or a shader of OTHERS) that feeds a socket, with its tree, or None; looks into groups."""
+    """Find the first Principled (or a shader of OTHERS) that feeds a socket, and its tree, or None; also in groups."""
     for link in socket.links:
         node = link.from_node
         if node.type == "BSDF_PRINCIPLED" or node.type in OTHERS:

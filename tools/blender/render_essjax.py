@@ -28,7 +28,7 @@ CIRCLE = 720
 
 
 def parse_args() -> argparse.Namespace:
-    """What stands after ``--`` in Blender, all arguments with bpy."""
+    """Parse what stands after ``--`` in Blender, all arguments with bpy."""
     in_blender = bool(bpy.app.binary_path)  # empty with bpy
     argv = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else ([] if in_blender else sys.argv[1:])
     parser = argparse.ArgumentParser(prog="render_essjax.py", description=__doc__.split("\n", 1)[0])
@@ -72,7 +72,7 @@ def open_scene(args: argparse.Namespace) -> str:
 
 
 def add_what_gltf_lacks() -> None:
-    """A sky if there is no light, and a camera that circles the scene if there is none."""
+    """Add a sky if there is no light, and a camera that circles the scene if there is none."""
     scene = bpy.context.scene
     kinds = {thing.type for thing in scene.objects}
     if "LIGHT" not in kinds:
@@ -104,7 +104,7 @@ def add_circling_camera(objects: list) -> None:
 
 
 def choose_camera(name: str | None):
-    """The camera, checked to be one that meta.json can describe."""
+    """Choose the camera, checked to be one that meta.json can describe."""
     scene = bpy.context.scene
     cameras = {thing.name: thing for thing in scene.objects if thing.type == "CAMERA"}
     default = scene.camera or (next(iter(cameras.values())) if len(cameras) == 1 else None)
@@ -121,7 +121,7 @@ def choose_camera(name: str | None):
 
 
 def prepare(scene, layer) -> None:
-    """Settings of both renders: nothing that moves samples, blurs, or works on the finished picture."""
+    """Set both renders up: nothing that moves samples, blurs, or works on the finished picture."""
     render = scene.render
     render.engine, render.resolution_percentage = "CYCLES", 100
     render.pixel_aspect_x = render.pixel_aspect_y = 1.0
@@ -169,7 +169,7 @@ def render_to(path: Path, scene, layer, *, size: tuple[int, int], samples: int, 
 
 
 def describe(camera, size: tuple[int, int], jitter: tuple[float, float]) -> dict:
-    """The frame's entry in meta.json."""
+    """Describe the frame for meta.json."""
     data = camera.data
     sensor = clip.sensor_width(*size, data.sensor_fit, (data.sensor_width, data.sensor_height))
     matrix = camera.matrix_world.normalized()  # as Blender renders: without scale

@@ -285,15 +285,15 @@ class BlenderClip:
 
     @property
     def source(self) -> dict[str, Any]:
-        """What the dataset keeps."""
+        """Return what the dataset keeps."""
         return {"preset": "blender", "folder": str(self.dump.folder.resolve()), "dynamic": list(self.dynamic)}
 
     def files(self, number: int) -> list[Path]:
-        """Of one frame."""
+        """List the files of one frame."""
         return [self.dump.folder / f"{kind}.{number:04d}.exr" for kind in ("lr", "hr")]
 
     def said(self, number: int) -> str:
-        """What ``meta.json`` says that matters to one frame."""
+        """Return what ``meta.json`` says that matters to one frame."""
         dump = self.dump
         camera, previous = dump.cameras[number], dump.cameras.get(number - 1)
         size = (dump.width, dump.height, dump.scale)
@@ -305,7 +305,7 @@ class BlenderClip:
 
 
 def open_blender(folder: Path, *, workers: int | None, skip_broken: bool) -> BlenderClip:
-    """The clip in a folder with ``meta.json``.
+    """Open the clip in a folder with ``meta.json``.
 
     Raises:
       ValueError: names the file and what is missing or wrong.

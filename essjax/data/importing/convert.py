@@ -7,7 +7,7 @@ Images are ``[H, W, C]`` float32.
 import numpy as np
 
 VELOCITY_ZERO = 32767 / 65535
-"""What Unreal's 16-bit velocity texture holds where nothing moves."""
+"""The value in Unreal's 16-bit velocity texture where nothing moves."""
 VELOCITY_RANGE = 0.499 * 0.5
 """Encoded velocity per unit of normalised device coordinates."""
 SHORT_NORMAL = 1e-3
@@ -129,13 +129,13 @@ def depth_from_distance(distance: np.ndarray, focal: np.ndarray, center: np.ndar
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """The inverse of the sRGB curve; values above 1 follow the same power law."""
+    """Invert the sRGB curve; values above 1 follow the same power law."""
     encoded = np.maximum(encoded, 0.0)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def unit_normals(stored: np.ndarray, encoding: str) -> np.ndarray:
-    """Unit vectors; zero where the stored one has no length.
+    """Scale normals to unit length; zero where the stored one has no length.
 
     Args:
       stored: ``[H, W, 3]``.
@@ -147,7 +147,7 @@ def unit_normals(stored: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def at_samples(image: np.ndarray, width: int, height: int, jitter: np.ndarray) -> np.ndarray:
-    """An image of a whole multiple of the frame's size, read at the pixel that each sample of the frame lies in.
+    """Read an image of a whole multiple of the frame's size at the pixel that each sample of the frame lies in.
 
     Args:
       image: ``[s*H, s*W, C]``; averaging would mix surfaces.
@@ -164,7 +164,7 @@ def at_samples(image: np.ndarray, width: int, height: int, jitter: np.ndarray) -
 
 
 def radical_inverse(index: int, base: int) -> float:
-    """The digits of ``index`` mirrored at the point: element ``index`` of the Halton sequence of ``base``."""
+    """Mirror the digits of ``index`` at the point: element ``index`` of the Halton sequence of ``base``."""
     if index < 0:
         raise ValueError(f"Halton: expected an element >= 0, got {index}.")
     value, weight = 0.0, 1.0 / base

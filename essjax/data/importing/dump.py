@@ -57,18 +57,18 @@ class RecipeClip:
         return tuple(self.digits)
 
     def path(self, image: str, number: int) -> Path:
-        """The file of an image, or of the "reference"."""
+        """Return the path of an image, or of the "reference"."""
         root = self.reference_root if image == "reference" and self.reference_root else self.root
         digits = self.others.get(image, {}).get(number, self.digits[number])
         return root / fill(self.recipe.pattern(image), self.sequence, digits)
 
     def files(self, number: int) -> list[Path]:
-        """What one frame is read from, there or not."""
+        """List the files that one frame is read from, there or not."""
         images = (*self.images, *(("reference",) if self.reference_root else ()))
         return list(dict.fromkeys(self.path(image, number) for image in images))
 
     def said(self, number: int) -> str:
-        """The facts of a frame and of the one before, as far as they are not in its files."""
+        """Return the facts of a frame and of the one before, as far as they are not in its files."""
         if "metadata" not in self.recipe.files:
             return ""
         said = []
@@ -160,7 +160,7 @@ class RecipeClip:
 def open_dump(
     source: Path, recipe: Recipe, reference: Path | None, make_facts: MakeFacts, preset: str, *, repair: bool = False
 ) -> list[RecipeClip]:
-    """The clips of a dump, in order of their names.
+    """Open the clips of a dump, in order of their names.
 
     Args:
       source: the dump's folder.

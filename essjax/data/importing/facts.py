@@ -1,4 +1,4 @@
-"""What a dump says about each frame beside its images: jitter, exposure, cuts, planes and cameras.
+"""Facts that a dump tells of each frame beside its images: jitter, exposure, cuts, planes and cameras.
 
 ``generic_facts`` reads the JSON of docs/guides/importing.md; presets whose dumps say it in another way have functions
 of their own (``arm``, ``unreal``).
@@ -53,7 +53,7 @@ def no_facts(number: int, header: Mapping[str, Any]) -> FrameFacts:
 
 
 def make_camera(camera_to_world: Any, focal: Any, center: Any) -> Camera:
-    """A camera of NumPy float32 leaves; ``camera_to_world`` as 4 x 4 nested lists, the others in pixels."""
+    """Make a camera of NumPy float32 leaves; ``camera_to_world`` as 4 x 4 nested lists, the others in pixels."""
     return Camera(
         camera_to_world=np.asarray(camera_to_world, np.float32).reshape(4, 4),
         focal=np.asarray(focal, np.float32).reshape(2),
@@ -67,7 +67,7 @@ def focal_length(fov: float, size: int) -> float:
 
 
 def lookup(path: Path, frames: Mapping[int, Mapping], number: int) -> Mapping:
-    """The record of a frame; a ValueError if there is none."""
+    """Find the record of a frame; a ValueError if there is none."""
     if number not in frames:
         raise ValueError(f"{path}: frame {number} is not listed there ({len(frames)} frames are).")
     return frames[number]

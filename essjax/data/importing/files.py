@@ -9,7 +9,7 @@ _PLACEHOLDERS = {"{sequence}": "(?P<sequence>[^/]*?)", "{frame}": r"(?P<frame>\d
 
 
 def fill(pattern: str, sequence: str, frame: str = "") -> str:
-    """The path that a pattern means."""
+    """Fill in the path that a pattern means."""
     return pattern.replace("{sequence}", sequence).replace("{frame}", frame)
 
 

@@ -173,7 +173,7 @@ def view_depth(stored: np.ndarray, recipe: Recipe, facts: FrameFacts, jitter: np
 
 
 def buffer(name: str, stored: np.ndarray, hit: np.ndarray, recipe: Recipe) -> tuple[np.ndarray, int]:
-    """An optional G-buffer: its range, its encoding, 0 on the background.
+    """Read an optional G-buffer: its range, its encoding, 0 on the background.
 
     Args:
       name: of the image.

@@ -83,7 +83,7 @@ def _arrays(path: Path) -> Mapping[str, np.ndarray]:
 
 
 def _array_of(path: Path, arrays: Mapping[str, np.ndarray], channel: str) -> tuple[np.ndarray, int]:
-    """The array that a channel belongs to, and its index there."""
+    """Find the array that a channel belongs to, and its index there."""
     name, _, index = channel.rpartition(".")
     if name not in arrays or not index.lstrip("-").isdigit():
         there = ", ".join(f"{n}.0".lstrip(".") for n in list(arrays)[: exr.SHOWN])

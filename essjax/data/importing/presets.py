@@ -27,7 +27,7 @@ from essjax.data.layout import (
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What an import found and did.
+    """Everything that an import found and did.
 
     Attributes:
       dataset: the dataset that was written.
@@ -58,7 +58,7 @@ class ImportReport:
 
 
 class Dump(NamedTuple):
-    """What is to be opened.
+    """A dump that is to be opened.
 
     Attributes:
       source: the dump's folder.
@@ -277,7 +277,7 @@ def _open_all(out: Path, clips: Sequence[Clip], kept: Mapping[str, SequenceInfo]
 
 
 def _first_frame(opened: OpenClip, skip_broken: bool) -> SequenceInfo:
-    """What the first frame that is not broken says about size and channels."""
+    """Find what the first frame that is not broken says about size and channels."""
     clip, writer, _ = opened
     reasons = []
     for number in clip.numbers:
@@ -302,7 +302,7 @@ def _write(opened: Sequence[OpenClip], skip_broken: bool, workers: int | None, o
 
 
 def _still(totals: Mapping[str, int]) -> list[str]:
-    """A warning about background that does not move with the cameras, as far as it is known."""
+    """Warn about background that does not move with the cameras, as far as it is known."""
     if not totals.get("still"):
         return []
     return [

@@ -30,7 +30,7 @@ RECIPES = Path(__file__).parent / "recipes"
 REQUIRED = ("color", "depth", "motion")
 """Images without which there is no dataset."""
 IMAGES = (*BUFFERS, "written")
-"""What a recipe may name files and channels of, "reference" aside; "written" is a mask, see ``MotionRule``."""
+"""Images whose files and channels a recipe may name, "reference" aside; "written" is a mask, see ``MotionRule``."""
 PACKED = ("motion", "depth")
 """Images that may be packed into bytes."""
 
@@ -197,7 +197,7 @@ def _channels(where: str, content: Mapping[str, Any]) -> dict[str, tuple[str, ..
 
 
 def make_recipe(content: Mapping[str, Any], where: str) -> Recipe:
-    """A recipe from the content of its TOML.
+    """Make a recipe from the content of its TOML.
 
     Raises:
       ValueError: begins with ``where``; names the table and key, what was expected and what came.
@@ -259,7 +259,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def load_recipe(preset: str, recipe: str | os.PathLike | None = None) -> Recipe:
-    """The recipe of a preset, with the keys that ``recipe`` changes; ``generic`` is ``recipe`` alone.
+    """Load the recipe of a preset, with the keys that ``recipe`` changes; ``generic`` is ``recipe`` alone.
 
     Raises:
       ValueError: a file cannot be read, or a table or key is wrong or missing.

@@ -94,7 +94,7 @@ def _segment(name: str, numbers: Sequence[int], split: str, chosen: Sequence) ->
 def fit_segments(
     segments: Mapping[str, Sequence[Segment]], clips: Mapping[str, Sequence[int]]
 ) -> dict[str, list[Segment]]:
-    """The same segments within the frames that were written: broken ones may be missing at the ends."""
+    """Fit the segments into the frames that were written: broken ones may be missing at the ends."""
     fitted: dict[str, list[Segment]] = {}
     for split, wanted in segments.items():
         for segment in wanted:

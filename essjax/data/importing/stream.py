@@ -47,25 +47,25 @@ class Clip(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the sequence to write."""
+        """Name the sequence to write."""
         ...
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Of its frames, ascending."""
+        """Number its frames, ascending."""
         ...
 
     @property
     def source(self) -> Mapping[str, Any]:
-        """What the dataset keeps about where it comes from; JSON types."""
+        """Return what the dataset keeps about where it comes from; JSON types."""
         ...
 
     def files(self, number: int) -> list[Path]:
-        """What one frame is read from, there or not."""
+        """List the files that one frame is read from, there or not."""
         ...
 
     def said(self, number: int) -> str:
-        """What is known about one frame beside its files, as far as it matters to it."""
+        """Return what is known about one frame beside its files, as far as it matters to it."""
         ...
 
     def convert(self, number: int) -> Converted:
@@ -82,7 +82,7 @@ class OpenClip(NamedTuple):
 
 
 def made_from(clip: Clip, number: int) -> str:
-    """A short text that changes with the name, size or date of a file of the frame, and with its metadata."""
+    """Make a short text that changes with the name, size or date of a file of the frame, and with its metadata."""
     files = [(path.name, *_size_and_date(path)) for path in clip.files(number)]
     return hashlib.blake2b(repr((files, clip.said(number))).encode(), digest_size=8).hexdigest()
 
@@ -195,7 +195,7 @@ def write_clip(
 
 
 def hint(opened: OpenClip, broken: int) -> str:
-    """What helps against a broken frame: leaving it out does not where all frames share its defect."""
+    """Say what helps against a broken frame: leaving it out does not where all frames share its defect."""
     clip, writer, pending = opened
     others = [number for number in pending if number > broken]
     if writer.info is not None or not others:

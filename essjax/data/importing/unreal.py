@@ -70,7 +70,7 @@ def _camera(header: Mapping[str, Any], which: str, width: int, height: int) -> C
 
 
 def header_facts(header: Mapping[str, Any], width: int, height: int) -> FrameFacts:
-    """The cameras of a frame and of the one before; none if the header does not hold them.
+    """Read the cameras of a frame and of the one before; none if the header does not hold them.
 
     Raises:
       ValueError: names what in the header is no number.
