@@ -9,6 +9,7 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
@@ -16,6 +17,7 @@ from rich.console import Console
 from essjax.data import Dataset, read_dataset
 from essjax.data.layout import write_json
 from essjax.deploy import method_cost
+from essjax.methods import save
 from essjax.typing import PyTree
 from experiments import datasets, health
 from experiments import environment as machine
@@ -96,7 +98,7 @@ class Clock:
 
 
 def run_experiment(request: Request, console: Console) -> dict[str, Any]:
-    """Run everything and write ``out / "metrics.json"`` and ``out / "report"``; returns the content of the former.
+    """Run everything, write ``metrics.json``, ``weights`` and ``report`` into ``out``; returns the first's content.
 
     Raises:
       ValueError: unknown variant, preset or setting, settings or data that do not fit, or of which no frame would be
@@ -211,8 +213,15 @@ def _tune(run: Run, trained: Mapping[str, Trained], phases: Phases) -> Tuned:
         run.request.out,
         lambda text: phases.show("tuning", text=text),
     )
+    for name in run.request.names:
+        save(weights_file(run.request.out, name), runners[name].method, runners[name].variables)
     phases.show("tuning", 1.0)
     return Tuned(runners, chosen, clips)
+
+
+def weights_file(out: Path, name: str) -> Path:
+    """Return where a run keeps what ``essjax.methods.load`` reads of variant ``name``."""
+    return out / "weights" / f"{name}.safetensors"
 
 
 def _evaluate(run: Run, trained: Mapping[str, Trained], tuned: Tuned, phases: Phases) -> Evaluated:
@@ -296,7 +305,8 @@ def _report(
     for number, remark in enumerate(remarks):
         console.print(remark, style="yellow" if number < len(urgent) else "dim", markup=False, soft_wrap=True)
     spent = ", ".join(f"{name} {value:.0f} s" for name, value in metrics["seconds"].items())
-    console.print(f"{spent}\nmetrics: {out / 'metrics.json'}\nreport:  {page}", markup=False, soft_wrap=True)
+    files = f"metrics: {out / 'metrics.json'}\nweights: {out / 'weights'}\nreport:  {page}"
+    console.print(f"{spent}\n{files}", markup=False, soft_wrap=True)
     return metrics
 
 

@@ -31,7 +31,7 @@ def save(path: str | Path, method: Method, variables: PyTree) -> None:
     colour and motion), the ``scale`` and a ``checksum`` (SHA-256 of all else).
 
     Args:
-      path: such as ``weights.safetensors``.
+      path: such as ``weights.safetensors``; its folder is made.
       method: from a factory of ``essjax.methods``.
       variables: dictionaries of arrays, as ``method.init`` makes them.
 
@@ -41,6 +41,7 @@ def save(path: str | Path, method: Method, variables: PyTree) -> None:
     path, tensors = Path(path), _flat(variables)
     header = {"format": FORMAT, "version": essjax.__version__, **_described(method), **_facts(method)}
     header["checksum"] = _checksum(header, tensors)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".tmp")
     save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
     temporary.replace(path)

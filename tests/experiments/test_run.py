@@ -7,9 +7,12 @@ import io
 import json
 import re
 
+import jax
 import numpy as np
 import pytest
 
+from essjax import methods
+from essjax.deploy import count_parameters
 from experiments import compare, comparison, datasets, run, variants
 from experiments.members import settings_of
 
@@ -66,6 +69,18 @@ def test_metrics_json(finished):
         ("extrass-w", "ess", "lr"), ("extrass-e", "ess", "lr"),
     }  # fmt: skip
     assert all(np.isfinite(row["psnr"]) and 5 < row["psnr"] < 60 for row in means.values())
+
+
+def test_the_weights_file_gives_what_was_trained(finished):
+    out, _, _ = finished
+    (path,) = (out / "weights").iterdir()
+    method, variables = methods.load(path)
+    assert path.name == "extrass.safetensors" and method.info.name == "extrass"
+    assert dict(method.recipe.arguments)["width"] == 8
+    costs = json.loads((out / "metrics.json").read_text())["costs"]["extrass"]
+    assert count_parameters(variables) == costs["parameters"]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(variables))
+    assert f"weights: {out / 'weights'}" in finished.printed
 
 
 def test_the_report_shows_every_method(finished):
