@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from essjax.typing import Array, Color, Image, Plane, Scalar
+from essjax.typing import Array, Color, Image, Plane, Scalar, Values
 
 ALBEDO_FLOOR = 0.04
 """Smallest divisor of a demodulation: below it noise in dark materials would be amplified."""
@@ -46,7 +46,7 @@ def expose(radiance: Image, exposure: Scalar) -> Image:
 
 
 @jax.custom_vjp
-def log1p(color: Image) -> Image:
+def log1p(color: Values) -> Values:
     """log(1 + x) of exposed colour: what networks see. Negative input counts as 0; there and at 0 the gradient is 0.
 
     The gradient is computed from the output, exp(-y): what made the input (a bicubic read, say) can then be fused with
@@ -67,12 +67,12 @@ def _log1p_backward(encoded, gradient):
 log1p.defvjp(_log1p_forward, _log1p_backward)
 
 
-def expm1(encoded: Image) -> Image:
+def expm1(encoded: Values) -> Values:
     """Inverse of ``log1p``; negative values become 0."""
     return jnp.expm1(jnp.maximum(encoded, 0.0))
 
 
-def reinhard(color: Image) -> Image:
+def reinhard(color: Values) -> Values:
     """Compress by x / (1 + x): [0, inf) to [0, 1). Negative input counts as 0."""
     color = jnp.maximum(color, 0.0)
     return color / (1.0 + color)
@@ -82,7 +82,7 @@ _REINHARD_LIMIT = 0.9999
 
 
 @jax.custom_vjp
-def log1p_of_reinhard(encoded: Image) -> Image:
+def log1p_of_reinhard(encoded: Values) -> Values:
     """log(1 + x) of ``encoded`` = x / (1 + x), which is -log(1 - encoded); clamped to [0, 0.9999] first.
 
     The gradient is computed from the output, exp(y), and 0 where clamped; see ``log1p``.
@@ -103,7 +103,7 @@ def _log1p_of_reinhard_backward(result, gradient):
 log1p_of_reinhard.defvjp(_log1p_of_reinhard_forward, _log1p_of_reinhard_backward)
 
 
-def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:
+def reinhard_inverse(encoded: Values, *, limit: float = 0.9999) -> Values:
     """Inverse of ``reinhard``; values above ``limit`` are clamped so that the result stays finite.
 
     Computed in float32: in 16 bits the limit would be 1.
@@ -113,29 +113,29 @@ def reinhard_inverse(encoded: Image, *, limit: float = 0.9999) -> Image:
     return (clipped / (1.0 - clipped)).astype(dtype)
 
 
-def srgb_encode(linear: Image) -> Image:
+def srgb_encode(linear: Values) -> Values:
     """Apply the sRGB transfer function (IEC 61966-2-1) on [0, 1]; finite gradient at 0."""
     safe = jnp.maximum(linear, 0.0031308)
     return jnp.where(linear <= 0.0031308, 12.92 * linear, 1.055 * safe ** (1.0 / 2.4) - 0.055)
 
 
-def srgb_decode(encoded: Image) -> Image:
+def srgb_decode(encoded: Values) -> Values:
     """Inverse of ``srgb_encode``."""
     safe = jnp.maximum(encoded, 0.04045)
     return jnp.where(encoded <= 0.04045, encoded / 12.92, ((safe + 0.055) / 1.055) ** 2.4)
 
 
-def display(color: Image) -> Image:
+def display(color: Values) -> Values:
     """Show colour as viewers see it and metrics score it: ``srgb_encode(reinhard(color))``, in [0, 1)."""
     return srgb_encode(reinhard(color))
 
 
-def display_of_log1p(encoded: Image) -> Image:
+def display_of_log1p(encoded: Values) -> Values:
     """``display(expm1(encoded))``, continued below 0 with its slope there, so that a loss leads back to colours."""
     return display(expm1(encoded)) + 12.92 * jnp.minimum(encoded, 0.0)
 
 
-def display_inverse(encoded: Color) -> Color:
+def display_inverse(encoded: Values) -> Values:
     """Inverse of ``display``; what is outside [0, 1) is clamped so that the result is finite and >= 0."""
     return reinhard_inverse(srgb_decode(jnp.clip(encoded, 0.0, 1.0)))
 

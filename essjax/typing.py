@@ -1,4 +1,4 @@
-"""Array aliases with named axes. ``...`` stands for any leading (time, batch) axes."""
+"""Array aliases with named axes: ``...`` is any leading (time, batch) axes; one name in a signature is one size."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,6 +27,16 @@ Ids = Int[Array, "... h w 1"]
 """Integer object id >= 0; 0 = static or none."""
 Positions = Float[Array, "... h w 2"]
 """Image positions (x, y) in pixels; the centre of the top left pixel is (0.5, 0.5)."""
+Resized = Float[Array, "... H W c"]
+"""An image made of one of another size, with its channels."""
+Places = Float[Array, "... H W 2"]
+"""Positions in, or motion on the pixels of, an image of another size."""
+Guide = Float[Array, "... h w g"]
+"""What tells surfaces apart, pixel by pixel: other channels than the image it goes with."""
+Level = Float[Array, "... _ _ _"]
+"""One of several images of different sizes and channels."""
+Values = Float[Array, "..."]
+"""Anything that a function works on number by number."""
 Jitter = Float[Array, "... 2"]
 """(x, y) in LR pixels in [-0.5, 0.5): the sample lies at pixel centre + jitter."""
 Scalar = Float[Array, "..."]
@@ -50,6 +60,7 @@ def pytree(cls: type[_T]) -> type[_T]:
 
 
 __all__ = [
-    "Array", "Bool", "Callable", "Color", "Flag", "Float", "Ids", "Image", "Int", "Jitter", "Key", "Mask", "Matrix4",
-    "Motion", "Plane", "Positions", "PyTree", "Scalar", "Vectors", "pytree",
+    "Array", "Bool", "Callable", "Color", "Flag", "Float", "Guide", "Ids", "Image", "Int", "Jitter", "Key", "Level",
+    "Mask", "Matrix4", "Motion", "Places", "Plane", "Positions", "PyTree", "Resized", "Scalar", "Values", "Vectors",
+    "pytree",
 ]  # fmt: skip

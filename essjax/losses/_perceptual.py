@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 from essjax.losses.pixel import check_same_shape
-from essjax.typing import Callable, Color, Image
+from essjax.typing import Callable, Color, Level
 
 
-def perceptual(prediction: Color, target: Color, features: Callable[[Color], Sequence[Image]]) -> list[Image]:
+def perceptual(prediction: Color, target: Color, features: Callable[[Color], Sequence[Level]]) -> list[Level]:
     """Squared feature differences, one unreduced map ``[..., h, w, C]`` per level: L_vgg of ExtraSS eq 12.
 
     Johnson et al. 2016, eq 2, before its mean; ``sum_of_means`` reduces it.

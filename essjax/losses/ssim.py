@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax.losses.pixel import as_float32
-from essjax.typing import Image
+from essjax.typing import Image, Resized
 
 
 def _gaussian_window(window: int, sigma: float) -> np.ndarray:
@@ -14,7 +14,7 @@ def _gaussian_window(window: int, sigma: float) -> np.ndarray:
     return weights / weights.sum()
 
 
-def _blur(image: Image, weights: np.ndarray) -> Image:
+def _blur(image: Image, weights: np.ndarray) -> Resized:
     """Separable filter where the window fits: ``[..., H - window + 1, W - window + 1, C]``.
 
     Shifted sums: a depthwise convolution is slower on CPU, a banded matrix product less exact on accelerators.
@@ -28,7 +28,7 @@ def _blur(image: Image, weights: np.ndarray) -> Image:
 
 def ssim_map(
     prediction: Image, target: Image, *, window: int = 11, sigma: float = 1.5, c1: float = 0.01**2, c2: float = 0.03**2
-) -> Image:
+) -> Resized:
     """SSIM of every pixel and channel whose window fits, ``[..., H - window + 1, W - window + 1, C]``.
 
     Args:

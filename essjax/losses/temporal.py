@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from essjax.losses.pixel import as_float32, l1
-from essjax.typing import Array, Color, Image, Mask
+from essjax.typing import Array, Color, Image, Level, Mask
 
 
 def temporal_l1(image: Color, warped_previous: Color, valid: Mask) -> Color:
@@ -45,7 +45,7 @@ def spatio_temporal(error: Image, error_previous: Image, *, theta: float) -> Ima
     return (1.0 - theta) * (jnp.abs(error) + jnp.abs(error_previous)) + theta * jnp.abs(error - error_previous)
 
 
-def feature_l1(features_a: Sequence[Image], features_b: Sequence[Image]) -> list[Image]:
+def feature_l1(features_a: Sequence[Level], features_b: Sequence[Level]) -> list[Level]:
     """Absolute differences level by level: l_1 of ExtraSS eq 13, between both encoders' features of one frame.
 
     Args:
@@ -65,6 +65,6 @@ def feature_l1(features_a: Sequence[Image], features_b: Sequence[Image]) -> list
     return [l1(a, b) for a, b in zip(features_a, features_b, strict=True)]
 
 
-def sum_of_means(levels: Sequence[Image]) -> Array:
+def sum_of_means(levels: Sequence[Level]) -> Array:
     """Mean of every level, summed: the sum over k in ExtraSS eq 8 and 13. Returns a scalar; 0 without levels."""
     return sum((jnp.mean(level) for level in levels), start=jnp.zeros((), jnp.float32))

@@ -14,7 +14,7 @@ import numpy as np
 
 from essjax.color import display
 from essjax.tensors import read_tensors
-from essjax.typing import Array, Callable, Color, Image
+from essjax.typing import Array, Callable, Color, Level
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -33,7 +33,7 @@ LAYERS = tuple(f"relu{block}_{conv}" for block, conv in _CONVOLUTIONS)
 
 def vgg16_features(
     weights_path: str | Path, *, layers: tuple[str, ...] = ("relu2_2",)
-) -> Callable[[Color], list[Image]]:
+) -> Callable[[Color], list[Level]]:
     """Make a feature function of linear HDR for ``perceptual``: VGG-16 activations (Simonyan and Zisserman 2015).
 
     The image is made display-referred (``color.display``), clipped to [0, 1] and normalised as ImageNet was. The
@@ -83,7 +83,7 @@ def _convolution(
     return {"weight": weight.transpose(2, 3, 1, 0), "bias": bias}
 
 
-def _activations(parameters: dict, image: Color, layers: tuple[str, ...]) -> list[Image]:
+def _activations(parameters: dict, image: Color, layers: tuple[str, ...]) -> list[Level]:
     shown = jnp.clip(display(image), 0.0, 1.0)
     leading = shown.shape[:-3]
     mean, deviation = (jnp.array(values, shown.dtype).reshape(1, 1, 1, 3) for values in (IMAGENET_MEAN, IMAGENET_STD))

@@ -25,7 +25,7 @@ from essjax.methods.rendered import (
 from essjax.methods.shots import within_shots
 from essjax.networks import frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
-from essjax.typing import Array, Color, Image, Mask, PyTree, pytree
+from essjax.typing import Array, Color, Image, Mask, PyTree, Resized, pytree
 from essjax.warp import backward_warp
 from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
 
@@ -97,7 +97,7 @@ def _length(vectors: Array) -> Array:
     return jnp.sqrt(sum_channels(vectors**2))
 
 
-def blend_mask(refined: Color, warped: Color, gbuffers: GBuffers, *, delta: float = REFINE_DELTA) -> Mask:
+def blend_mask(refined: Resized, warped: Color, gbuffers: GBuffers, *, delta: float = REFINE_DELTA) -> Mask:
     """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear)."""
     base, normal = surface_guides(gbuffers)
     base_half, normal_half = _enlarge(halve(base), base), _enlarge(halve(normal), normal)

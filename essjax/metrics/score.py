@@ -45,7 +45,7 @@ def score_rollout(
     exposure: Scalar | float | None = None,
     holes: Mask | None = None,
     motion: Motion | None = None,
-    cuts: Sequence[bool] | None = None,
+    cuts: Sequence[bool] | np.ndarray | None = None,
 ) -> dict[int, dict[str, Any]]:
     """Metrics of the chosen frames of one sequence, on display-referred images (``color.display`` is applied here).
 
@@ -108,7 +108,7 @@ def score_rollout(
     return rows
 
 
-def has_source(kinds: Sequence[str], cuts: Sequence[bool]) -> np.ndarray:
+def has_source(kinds: Sequence[str], cuts: Sequence[bool] | np.ndarray) -> np.ndarray:
     """Whether each frame has anything to be made of: it, or one before it in its shot, was rendered; bool ``[T]``.
 
     Others show what a method falls back to (``methods.shots.unlit``), and say nothing about it.
@@ -123,7 +123,7 @@ def has_source(kinds: Sequence[str], cuts: Sequence[bool]) -> np.ndarray:
     return latest >= number - _frames_since_cut(len(rendered), cuts)
 
 
-def _frames_since_cut(length: int, cuts: Sequence[bool] | None) -> np.ndarray:
+def _frames_since_cut(length: int, cuts: Sequence[bool] | np.ndarray | None) -> np.ndarray:
     """How many frames before each one belong to the same shot."""
     starts = np.zeros(length, bool) if cuts is None else np.array(cuts, bool)
     starts[0] = True

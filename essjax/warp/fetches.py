@@ -2,12 +2,12 @@
 
 import jax.numpy as jnp
 
-from essjax.typing import Array, Image, Positions
+from essjax.typing import Array, Image, Places, Resized
 from essjax.warp._batch import check_channels
 from essjax.warp.sampling import cubic_weights, sample
 
 
-def sample_by_fetches(image: Image, positions: Positions, *, fetches: int = 9, parameter: float = -0.75) -> Image:
+def sample_by_fetches(image: Image, positions: Places, *, fetches: int = 9, parameter: float = -0.75) -> Resized:
     """Read ``image`` at ``positions`` with Keys' bicubic kernel from 9 bilinear fetches, or from 5 of them.
 
     One fetch between the two inner pixels, at the ratio of their weights, stands for both, so that 4 x 4 pixels take

@@ -16,7 +16,7 @@ import numpy as np
 
 from essjax import kernels
 from essjax.frames import GBuffers, surface_guides
-from essjax.typing import Array, Image, Motion
+from essjax.typing import Array, Guide, Image, Motion
 from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.candidates import BORDER, FAR, LEAST, LIMIT, MARGIN, REACH, UNUSABLE, candidate_offsets
 from essjax.warp.sampling import gather_pixels
@@ -33,7 +33,7 @@ SELECTIONS = ("network", "reference")
 IMPLEMENTATIONS = ("auto", *SELECTIONS, "triton")
 
 
-def guides(gbuffers: GBuffers) -> Image:
+def guides(gbuffers: GBuffers) -> Guide:
     """Make the guide of eq 2: base colour and normal, ``[..., H, W, 6]``."""
     return jnp.concatenate(surface_guides(gbuffers), axis=-1)
 
@@ -269,8 +269,8 @@ def _run(kernel, images, guide_previous, guide, motion, sigma_guide, sigma_dista
 
 def gbuffer_guided_warp(
     radiance: Image,
-    guide_previous: Image,
-    guide: Image,
+    guide_previous: Guide,
+    guide: Guide,
     motion: Motion,
     *,
     sigma_guide: float | Array | tuple[float, ...] = SIGMA_GUIDE,
@@ -316,8 +316,8 @@ def gbuffer_guided_warp(
 
 
 def guided_weights(
-    guide_previous: Image,
-    guide: Image,
+    guide_previous: Guide,
+    guide: Guide,
     motion: Motion,
     *,
     sigma_guide: float | Array | tuple[float, ...] = SIGMA_GUIDE,

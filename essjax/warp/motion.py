@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
-from essjax.typing import Array, Image, Jitter, Mask, Motion, Plane
+from essjax.typing import Array, Image, Jitter, Mask, Motion, Places, Plane
 from essjax.warp._batch import check_channels
 from essjax.warp._splat import splat_nearest
 from essjax.warp.sampling import inside_mask, sample
@@ -70,7 +70,7 @@ def compose_motion(
     return total, valid
 
 
-def upsample_motion(motion: Motion, scale: float, *, jitter: Jitter | None = None, mode: str = "bilinear") -> Motion:
+def upsample_motion(motion: Motion, scale: float, *, jitter: Jitter | None = None, mode: str = "bilinear") -> Places:
     """Motion at a higher resolution, in its pixels: values times ``scale``.
 
     HR pixel P reads at (P + 0.5) / scale - jitter, because LR motion is stored at the jittered sample positions
@@ -95,7 +95,7 @@ def _shifted(image: Array, dy: int, dx: int, radius: int, height: int, width: in
     return image[..., radius + dy : radius + dy + height, radius + dx : radius + dx + width, :]
 
 
-def dilate_motion(motion: Motion, depth: Plane, *, radius: int = 1) -> Motion:
+def dilate_motion(motion: Image, depth: Plane, *, radius: int = 1) -> Image:
     """Motion of the nearest surface in the (2 radius + 1)^2 neighbourhood, so that edges move with the foreground.
 
     Args:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from essjax.typing import Array, Image, Jitter, Mask
+from essjax.typing import Array, Guide, Image, Jitter, Mask
 from essjax.warp._batch import check_channels
 from essjax.warp.sampling import gather_pixels
 from essjax.warp.upsample import check_jitter, check_scale, zero_upsample
@@ -112,7 +112,7 @@ def _resample(color: Image, bounded: Image, jitter: Jitter, axis: Callable) -> R
     return jax.tree.map(lambda x: x.reshape(*leading, *x.shape[1:]), results)
 
 
-def gaussian_resample(color: Image, bounded: Image, jitter: Jitter, sigma: Array, scale: int) -> Resampled:
+def gaussian_resample(color: Image, bounded: Guide, jitter: Jitter, sigma: Array, scale: int) -> Resampled:
     """Resample LR samples to the output grid with a Gaussian over the 3 x 3 nearest (thesis 002 eq 38, 41, 42).
 
     Args:
@@ -129,7 +129,7 @@ def gaussian_resample(color: Image, bounded: Image, jitter: Jitter, sigma: Array
     return _resample(color, bounded, jitter, lambda size, j: _gaussian_axis(size, scale, j, sigma))
 
 
-def tent_resample(color: Image, bounded: Image, jitter: Jitter, scale: int) -> Resampled:
+def tent_resample(color: Image, bounded: Guide, jitter: Jitter, scale: int) -> Resampled:
     """Resample with a tent of one output pixel (eq 38, 40); β is 1 in the pixel that a sample fell into, else 0.
 
     The colour is 0 where no sample is within a pixel, as is β there. Arguments and errors as ``gaussian_resample``.

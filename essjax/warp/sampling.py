@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from essjax import kernels
 from essjax.cameras import pixel_positions
-from essjax.typing import Array, Image, Mask, Motion, Positions
+from essjax.typing import Array, Image, Mask, Motion, Places, Resized
 from essjax.warp._batch import check_channels
 
 OUTSIDE = ("border", "zeros")
@@ -181,7 +181,7 @@ def _cubic_backward(mode, outside, residuals, gradient):
 _sample_cubic.defvjp(_cubic_forward, _cubic_backward)
 
 
-def sample(image: Image, positions: Positions, *, mode: str = "bilinear", outside: str = "border") -> Image:
+def sample(image: Image, positions: Places, *, mode: str = "bilinear", outside: str = "border") -> Resized:
     """Read ``image`` at ``positions``.
 
     Weights and sums are float32 whatever the image's type. Bicubic differentiates in reverse mode only. Finite

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
-from essjax.typing import Array, Image, Jitter, Positions
+from essjax.typing import Array, Float, Image, Jitter, Places, Positions, Resized
 from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.sampling import Tap, axis_taps, check_mode, gather_pixels, sample
 
@@ -32,7 +32,7 @@ def _sample_offset(jitter: Jitter, scale: int) -> Array:
     return jnp.clip(jnp.floor((jitter + 0.5) * scale), 0, scale - 1)  # the clip is for rounding at 0.5
 
 
-def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Image:
+def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Resized:
     """Each LR sample in the HR pixel that it fell into, 0 elsewhere (DLCTUS; SPEC 4).
 
     The HR pixel is ``scale * p + floor((jitter + 0.5) * scale)``. Upsample an image of ones for the mask.
@@ -69,7 +69,7 @@ def _sparse_taps(positions: Array, size: int, scale: int, offset: Array) -> Tap:
     return Tap(index, weight)
 
 
-def sample_zero_upsampled(image: Image, positions: Positions, scale: int, jitter: Jitter) -> Image:
+def sample_zero_upsampled(image: Image, positions: Places, scale: int, jitter: Jitter) -> Resized:
     """``sample(zero_upsample(image, scale, jitter), positions, outside="zeros")`` without making the large image.
 
     Of the four HR pixels that bilinear interpolation reads, one at most holds a sample: one gather instead of four,
@@ -114,7 +114,7 @@ def _along(image: Array, taps: list[Tap], axis: int) -> Array:
     return functools.reduce(jnp.add, weighted)
 
 
-def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode: str = "bilinear") -> Image:
+def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode: str = "bilinear") -> Resized:
     """JAU: HR pixel P reads the LR image at (P + 0.5) / scale - jitter, where its samples really are (SPEC 4).
 
     All rows share their vertical position and all columns their horizontal one, so it is two 1-D interpolations.
@@ -169,7 +169,7 @@ def sample_distance(height: int, width: int, scale: int, jitter: Jitter) -> Posi
     return samples * scale - centers
 
 
-def space_to_depth(x: Image, block: int) -> Image:
+def space_to_depth(x: Image, block: int) -> Float[Array, "... H W C"]:
     """Fold blocks of pixels into channels: ``[..., H, W, C]`` to ``[..., H / block, W / block, block^2 C]``.
 
     Channel order (dy, dx, c): ``out[i, j, (dy * block + dx) * C + c] = x[i * block + dy, j * block + dx, c]``.
@@ -188,7 +188,7 @@ def space_to_depth(x: Image, block: int) -> Image:
     return x.reshape(*x.shape[:-3], block * block * channels)
 
 
-def depth_to_space(x: Image, block: int) -> Image:
+def depth_to_space(x: Image, block: int) -> Float[Array, "... H W C"]:
     """Inverse of ``space_to_depth``: ``[..., h, w, block^2 C]`` to ``[..., h block, w block, C]``.
 
     Raises:
