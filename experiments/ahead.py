@@ -16,7 +16,7 @@ from experiments.variants import Stage
 
 
 def batch_shapes(settings: Settings, stage: Stage) -> Sequence:
-    """What ``make_batches`` gives on the built-in scenes, as ``jax.ShapeDtypeStruct``s; one small frame is rendered."""
+    """Return what ``make_batches`` gives on the built-in scenes, as shapes; one small frame is rendered."""
     width, height = check_crop(stage.settings, *settings.data.size, settings.data.scale)
     clip = Clip("train", "carousel", 0, frames=1, spp=1)
     one = live_source([clip], width, height, rendering=rendering_of(settings, ranges=stage.ranges))[0]
@@ -28,7 +28,7 @@ class Ahead:
     """The train steps of a variant on the built-in scenes, in the making: a thread compiles them in order."""
 
     def __init__(self, member: Member):
-        """Starts at once."""
+        """Start at once."""
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="essjax-ahead")
         futures = {stage.name: self._worker.submit(_compile, member, stage) for stage in member.stages}
         self.steps = {name: _Awaited(list(futures.values()), step) for name, step in futures.items()}
@@ -55,7 +55,7 @@ class _Awaited:
 
 
 def state_shapes(member: Member, stage: Stage, batch: Sequence) -> TrainState:
-    """The state that ``train_member`` starts ``stage`` with, as ``jax.ShapeDtypeStruct``s."""
+    """Return the state that ``train_member`` starts ``stage`` with, as ``jax.ShapeDtypeStruct``s."""
 
     def make(key: Array, batch: Sequence) -> TrainState:
         variables = member.stages[-1].method.init(key, select_time(batch.frames, 0))

@@ -23,7 +23,7 @@ COLUMNS = {
     "psnr_foreground": "PSNR of the foreground", "psnr_reference": "foreground against the reference",
 }  # fmt: skip
 PACE = ("steps", "seconds", "compile_seconds")
-"""Of each stage of a run, for its pace."""
+"""Fields of each stage of a run, for its pace."""
 HEAD = """# Benchmarks
 
 Generated from `experiments/results/*.json` by `python -m experiments.benchmarks_page`; do not edit. Each table is the
@@ -75,7 +75,7 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
 
 
 def _alike(run: dict[str, Any]) -> dict[str, Any]:
-    """What runs with several seeds have in common, field -> value; settings are None in files older than they."""
+    """Return what runs with several seeds share, field -> value; settings are None in files older than they."""
     environment, configs = run["environment"], run.get("configs")
     settings = configs and {name: {**config, "seed": None} for name, config in configs.items()}
     parts = {field: run[field] for field in ("variant", "preset", "dataset")}
@@ -91,7 +91,7 @@ def _keep_tables(name: str, paths: Sequence[Path], content: dict[str, Any]) -> P
 
 
 def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of the mean over sequences, averaged over runs."""
+    """Average the rows of the mean over sequences over runs."""
     labels = ("method", "frames", "resolution")
     tables = [
         {tuple(row[label] for label in labels): row for row in run["rows"] if row["sequence"] == "mean"} for run in runs
@@ -111,7 +111,7 @@ def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def page(results: list[tuple[str, dict[str, Any]]]) -> str:
-    """The whole page."""
+    """Make the whole page."""
     sections = {"import": _import_section, "tables": _tables_section, "benchmark": section}
     return "\n".join(
         [HEAD, *(sections.get(metrics.get("kind", ""), _section)(name, metrics) for name, metrics in results)]
@@ -139,7 +139,7 @@ def _import_section(name: str, metrics: dict[str, Any]) -> str:
 
 
 def _tables_section(name: str, content: dict[str, Any]) -> str:
-    """The papers' tables on our scenes (experiments/tables)."""
+    """Show the papers' tables on our scenes (experiments/tables)."""
     lines = [
         f"## {name}",
         "",
@@ -220,7 +220,7 @@ def _as_list(value: Any) -> list[Any]:
 
 
 def current() -> str:
-    """The page as the results folder has it."""
+    """Make the page as the results folder has it."""
     return page([(path.stem, json.loads(path.read_text())) for path in sorted(RESULTS.glob("*.json"))])
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 MOST_BYTES = 1 << 30
-"""What stays in the folder between commands; a default run writes about 50 MB."""
+"""Bytes that stay in the folder between commands; a default run writes about 50 MB."""
 LEAST_SECONDS = 0.2
 """Programs that compile sooner are not worth a file."""
 

@@ -1,4 +1,4 @@
-"""What is refused before anything is rendered, read or trained: settings and data that do not fit together."""
+"""Checks before anything is rendered, read or trained: settings and data that do not fit together."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -62,12 +62,12 @@ def check_scored(dataset: Dataset, settings: Settings) -> None:
 
 
 def scored_splits(settings: Settings) -> tuple[str, ...]:
-    """Splits whose frames are scored in a run."""
+    """List the splits whose frames are scored in a run."""
     return ("validation", "test") if settings.evaluation.tune or settings.training.validations else ("test",)
 
 
 def _has_scored(dataset: Dataset, segment: Segment, settings: Settings) -> bool:
-    """What ``load_clip`` will find, without reading an image."""
+    """Say whether ``load_clip`` will find frames that are scored, without reading an image."""
     cuts = {record["number"]: record["cut"] for record in dataset.sequences[segment.sequence].frames}
     numbers = dataset.numbers(segment)
     return bool(scored_frames([cuts[n] for n in numbers], dataset.scored(segment), settings.evaluation.warmup))

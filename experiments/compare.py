@@ -25,7 +25,7 @@ class CompareOptions(Options):
 
 
 def parse(arguments: Sequence[str] | None = None) -> CompareOptions:
-    """The command line."""
+    """Parse the command line."""
     return parse_as(CompareOptions, "compare", arguments)
 
 

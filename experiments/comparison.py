@@ -20,7 +20,7 @@ from experiments.variants import VARIANTS
 
 
 class Trained(NamedTuple):
-    """What training a variant gave.
+    """The results of training a variant.
 
     Attributes:
       initial: entry -> linen variables, before training.
@@ -98,7 +98,7 @@ def table_references(runners: Mapping[str, Runner], scale: int) -> dict[str, str
 
 
 def unequal(info: MethodInfo, scale: int) -> str:
-    """What a method gets that others do not (more pixels, a later frame); an empty string if nothing.
+    """Say what a method gets that others do not (more pixels, a later frame); an empty string if nothing.
 
     Args:
       info: of the method.
@@ -133,7 +133,7 @@ def _left_out(members: Mapping[str, Member], names: Sequence[str], sequence: Fra
 def notes(
     members: Mapping[str, Member], names: Sequence[str], clips: Sequence[Clip], chosen: Mapping[str, Setting]
 ) -> list[str]:
-    """What the reader of the table with the variants ``names`` must know."""
+    """Collect what the reader of the table with the variants ``names`` must know."""
     warmup = members[names[0]].settings.evaluation.warmup
     share = sum(clip.holes[clip.scored].mean() for clip in clips) / len(clips)
     exact = "exact, from the renderer" if clips[0].exact_holes else "estimated from the G-buffers"

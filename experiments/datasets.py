@@ -23,7 +23,7 @@ def train_clips(settings: Settings, number: int = 0) -> list[Clip]:
 
 
 def scene_clips(settings: Settings) -> list[Clip]:
-    """The built-in scenes of a run: of all splits."""
+    """List the built-in scenes of a run: of all splits."""
     data = settings.data
     return [
         *train_clips(settings),

@@ -1,4 +1,4 @@
-"""What a result was measured with: commit, device, versions."""
+"""The setting of a measurement: commit, device, versions."""
 
 import os
 import platform
@@ -13,7 +13,7 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
 
 
 def commit(root: Path) -> str:
-    """Of the clone ``root``; "unknown" where it is none, also inside another repository (in a virtual environment)."""
+    """Name the commit of the clone ``root``; "unknown" where it is none, also inside another repository."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(root), *arguments]

@@ -56,13 +56,13 @@ class Clip:
 
 
 def shown_exposure(sequence: Sequence) -> np.ndarray:
-    """What metrics and pictures multiply radiance with ``[T]``: the recorded exposure, else ``clip_exposure``."""
+    """Return what metrics and pictures multiply radiance with ``[T]``: the recorded exposure or ``clip_exposure``."""
     recorded, reference = sequence.frames.exposure, sequence.reference
     return np.asarray(np.full(len(reference), clip_exposure(reference)) if recorded is None else recorded, np.float32)
 
 
 def scored_frames(cuts: Iterable[Any], counts: Iterable[Any], warmup: int) -> list[int]:
-    """Indices of the frames that are scored.
+    """List the indices of the frames that are scored.
 
     Args:
       cuts: of each frame, whether it is one; the first always is.
@@ -168,7 +168,7 @@ def schedules(method: Method) -> list[Schedule]:
 
 @functools.partial(jax.jit, static_argnames="scale")
 def reference_at_samples(reference: Array, frames: Frame, scale: int) -> Array:
-    """The reference read where each LR sample was taken, ``[T, H, W, 3]``."""
+    """Read the reference where each LR sample was taken, ``[T, H, W, 3]``."""
     positions = scale * pixel_positions(frames.motion.shape[-3], frames.motion.shape[-2], frames.jitter)
     return jnp.maximum(sample(reference, positions, mode="bilinear"), 0.0)
 
@@ -228,7 +228,7 @@ def has_image(clip: Clip, n: int, method: Method, kinds: collections.abc.Sequenc
 
 
 def picture_frames(clip: Clip, count: int) -> list[int]:
-    """Indices of the frames to show: those with the most holes among the scored ones."""
+    """Choose the frames to show: those with the most holes among the scored ones."""
     shares = clip.holes.mean(axis=(1, 2, 3))
     return sorted(clip.scored, key=lambda n: -shares[n])[:count]
 
@@ -281,7 +281,7 @@ def evaluate(
 
 
 def _sorted_images(picture: dict, names: Iterable[str]) -> dict:
-    """The images in the table's order, whichever thread came first."""
+    """Put the images into the table's order, whichever thread came first."""
     order = ["input", *names, "reference"]
     parts = {
         part: {name: picture[part][name] for name in order if name in picture[part]} for part in ("images", "previous")

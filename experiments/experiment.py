@@ -40,7 +40,7 @@ from experiments.variants.base import Found
 
 
 class Run(NamedTuple):
-    """What was prepared.
+    """A run that was prepared.
 
     Attributes:
       request: what was asked for.
@@ -63,7 +63,7 @@ class Run(NamedTuple):
 
     @property
     def settings(self) -> Settings:
-        """Of the first one: what all have in common is there."""
+        """Return those of the first one: what all have in common is there."""
         return self.wanted[0].settings
 
 
@@ -76,7 +76,7 @@ class Tuned(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """What ``evaluate`` gives, what variants found beyond it, the hole mask's scores, dead networks."""
+    """The results of ``evaluate``, of variants beyond it, the hole mask's scores, dead networks."""
 
     images: dict[str, Any]
     found: dict[str, Found]
@@ -250,7 +250,7 @@ def _dead_methods(
     rows: Sequence[Mapping[str, Any]],
     clip: Clip,
 ) -> list[str]:
-    """A message for each method whose pictures say that its network does nothing."""
+    """Name each method whose pictures say that its network does nothing."""
     # After a few steps hardly anything is seen; that they were few is said.
     learned = {owner for owner, found in trained.items() if not health.has_few_steps(found.report)}
     owners = {row: run.members[row].owner if run.members[row].owner in learned else None for row in runners}
@@ -330,7 +330,7 @@ def _losses(trainings: Mapping[str, Member], trained: Mapping[str, Trained]) -> 
 
 
 def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """Method -> parameters, multiply-adds per frame of each kind at this dataset's size, latency in frames."""
+    """Count, method by method, parameters, multiply-adds of each kind of frame at the dataset's size, latency."""
     found = {}
     for name, runner in runners.items():
         enlarged = dataset.info.scale if runner.method.info.native else 1

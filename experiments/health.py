@@ -46,7 +46,7 @@ def _validations(validated: Sequence[Mapping[str, float]]) -> str:
 
 
 def no_gain(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A warning for each stage whose best validation is below that of its start."""
+    """Warn of each stage whose best validation is below that of its start."""
     messages = []
     for stage, found in reports.items():
         validated = list(found["validated"])
@@ -67,7 +67,7 @@ def has_few_steps(reports: Mapping[str, Mapping[str, Any]]) -> bool:
 
 
 def few_steps(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A warning for each stage that ended too soon to have learned much."""
+    """Warn of each stage that ended too soon to have learned much."""
     return [
         f"{stage} made only {_steps(found['steps'])}: too few to learn much, so its numbers say little. Give it more "
         f"with --set {stage.split('/')[-1]}.seconds=N (or .steps=N), or a faster or less busy machine."
@@ -86,7 +86,7 @@ def is_still(still: int, steps: int) -> bool:
 
 
 def still_stages(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A message for each stage whose gradient is exactly zero."""
+    """Name each stage whose gradient is exactly zero."""
     return [
         f"{stage}: the gradient is exactly zero since step {found['steps'] - found['still'] + 1} of {found['steps']}."
         for stage, found in reports.items()
@@ -95,7 +95,7 @@ def still_stages(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def same_rows(rows: Sequence[Mapping[str, Any]], owners: Mapping[str, str | None]) -> list[str]:
-    """A message for each trained method whose row is that of another method in every sequence and kind.
+    """Name each trained method whose row is that of another method in every sequence and kind.
 
     Args:
       rows: of ``metrics.json``.
@@ -117,7 +117,7 @@ def same_rows(rows: Sequence[Mapping[str, Any]], owners: Mapping[str, str | None
 
 
 def unchanged(name: str, runner: Runner, initial: PyTree, clip: Clip) -> list[str]:
-    """A message if a trained method shows what it showed before training.
+    """Say if a trained method shows what it showed before training.
 
     Args:
       name: of the method.

@@ -11,7 +11,7 @@ from experiments.evaluate import Clip, estimated_valid
 
 
 def mask_scores(clips: collections.abc.Sequence[Clip]) -> dict[str, dict[str, Any]]:
-    """Of the class "hole" in the scored frames, each against the frame before, over LR pixels.
+    """Score the class "hole" in the scored frames, each against the frame before, over LR pixels.
 
     Args:
       clips: the test sequences; one is in use at a time.

@@ -31,7 +31,7 @@ class Member(NamedTuple):
 
 
 def settings_of(name: str, preset: str, overrides: Sequence[str] = (), others: Sequence[str] = ()) -> Settings:
-    """The settings of a run of ``name``: the preset, what the variant changes in it, then ``--set``.
+    """Resolve the settings of a run of ``name``: the preset, what the variant changes in it, then ``--set``.
 
     Args:
       name: of the variant.
@@ -63,7 +63,7 @@ def settings_of(name: str, preset: str, overrides: Sequence[str] = (), others: S
 
 
 def all_settings(names: Sequence[str], preset: str, overrides: Sequence[str]) -> dict[str, Settings]:
-    """Of each variant of a run, see ``settings_of``."""
+    """Resolve those of each variant of a run, see ``settings_of``."""
     return {name: settings_of(name, preset, overrides, [other for other in names if other != name]) for name in names}
 
 
@@ -97,7 +97,7 @@ def _member(name: str, settings: Settings, folder: Path, stages: tuple[Stage, ..
 
 
 def _compared(row: str, wanted: Mapping[str, Member], shared: Settings, preset: str, out: Path) -> Member:
-    """A row that nobody asked for: of a training's variables, a part, a baseline, or a part that nothing trains."""
+    """Make a row that nobody asked for: of a training's variables, a part, a baseline, or an untrained part."""
     variant = VARIANTS[row]
     for member in wanted.values():
         renamed = VARIANTS[member.name].parts.get(row)

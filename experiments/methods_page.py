@@ -27,7 +27,7 @@ Where a frame's reactive mask is 1, a *rendered* frame shows nothing of its hist
 
 
 def line(name: str) -> str:
-    """The row of one method."""
+    """Make the row of one method."""
     method, page = VARIANTS[name].method(settings_of(name, "paper")), VARIANTS[name].page
     assert page is not None
     info, factor = method.info, 2 if method.info.native else 1
@@ -45,7 +45,7 @@ def line(name: str) -> str:
 
 
 def page() -> str:
-    """The whole page."""
+    """Make the whole page."""
     return HEAD + "\n".join(line(name) for name, variant in VARIANTS.items() if variant.page) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""What a run is doing: bars on a terminal, anywhere else a line per phase and minute."""
+"""Progress of a run: bars on a terminal, anywhere else a line per phase and minute."""
 
 import threading
 import time
@@ -63,7 +63,7 @@ class Phases:
                 self._print_line(again=True)
 
     def _print_line(self, *, again: bool = False) -> None:
-        """The state with the time since the start; the same one twice only where it is asked for ``again``."""
+        """Print the state with the time since the start; the same one twice only where it is asked for ``again``."""
         if self._state and (again or self._state != self._printed):
             minutes, seconds = divmod(int(time.monotonic() - self._began), 60)
             line = f"{minutes:3d}:{seconds:02d} {self._state}"
@@ -91,12 +91,12 @@ class TrainingProgress(Watcher):
             self.events.close()
 
     def on_compile(self, stage):
-        """The bar says that it waits."""
+        """Say on the bar that it waits."""
         self.still = 0
         self.phases.show(f"train {self.prefix}{stage}", text="compiling (the clock of the training waits)")
 
     def on_step(self, stage, step, progress, terms):
-        """The bar moves; a network that is dead by now is named."""
+        """Move the bar; a network that is dead by now is named."""
         self.still = 0 if terms["gradient_norm"] else self.still + 1
         self.phases.show(f"train {self.prefix}{stage}", progress, f"step {step}, loss {terms['loss']:.4f}")
         if self.events:
@@ -108,7 +108,7 @@ class TrainingProgress(Watcher):
             )  # fmt: skip
 
     def on_validation(self, stage, step, progress, scores):
-        """The bar shows the scores."""
+        """Show the scores on the bar."""
         found = ", ".join(f"{kind.upper()} {value:.2f} dB" for kind, value in scores.items()) or "validating"
         self.phases.show(f"train {self.prefix}{stage}", progress, f"step {step}, {found}")
         if self.events:

@@ -1,4 +1,4 @@
-"""What a run was asked for, and whether its folder is free for that."""
+"""Requests: what a run was asked for, and whether its folder is free for that."""
 
 import json
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from experiments.settings import Settings, flatten
 
 
 class Request(NamedTuple):
-    """What a command line asks for.
+    """All that a command line asks for.
 
     Attributes:
       names: the variants.
@@ -39,7 +39,7 @@ def default_folder(name: str, preset: str, data: str | None) -> Path:
 
 
 def run_record(request: Request, settings: Mapping[str, Settings]) -> dict[str, Any]:
-    """What ``out / "run.json"`` says of a run: variants, data, and each setting under its path."""
+    """Return what ``out / "run.json"`` says of a run: variants, data, and each setting under its path."""
     flat = {f"{name}:{path}": value for name, own in settings.items() for path, value in flatten(own).items()}
     if len(settings) == 1:
         flat = {key.partition(":")[2]: value for key, value in flat.items()}

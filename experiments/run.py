@@ -18,7 +18,7 @@ Folder = Annotated[str | None, tyro.conf.arg(metavar="DIR")]
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What ``run``, ``compare`` and ``tables`` have in common."""
+    """Options that ``run``, ``compare`` and ``tables`` have in common."""
 
     data: Folder = None
     """an essjax dataset; without it the built-in scenes are rendered"""
@@ -40,7 +40,7 @@ class Options:
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """Of all ``--set``."""
+        """Return those of all ``--set``."""
         return tuple(itertools.chain(*self.set))
 
     def run(self, names: Sequence[str], out: Path, console: Console, more: Sequence[str] = ()) -> dict[str, Any]:
@@ -69,14 +69,14 @@ class RunOptions(Options):
 
 
 def parse_as(kind: type, command: str, arguments: Sequence[str] | None) -> Any:
-    """The command line of ``python -m experiments.COMMAND`` as a ``kind``."""
+    """Parse the command line of ``python -m experiments.COMMAND`` as a ``kind``."""
     return tyro.cli(
         kind, prog=f"python -m experiments.{command}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
 
 
 def parse(arguments: Sequence[str] | None = None) -> RunOptions:
-    """The command line."""
+    """Parse the command line."""
     return parse_as(RunOptions, "run", arguments)
 
 
@@ -115,7 +115,7 @@ def exit_code(metrics: Mapping[str, Any], console: Console) -> int:
 
 
 def print_variants(console: Console) -> int:
-    """What ``--list`` prints."""
+    """Print what ``--list`` asks for."""
     from experiments.variants import VARIANTS
 
     width = max(len(name) for name in VARIANTS)

@@ -22,7 +22,7 @@ Table = Mapping[str, tuple[Any, Any, Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """What the renderer makes; ignored with ``--data``. Lengths in frames, sizes in LR pixels, sequences per family.
+    """Scenes to render; ignored with ``--data``. Lengths in frames, sizes in LR pixels, sequences per family.
 
     ``train_spp`` is also validation's, ``test_frames`` too. mip_bias (thesis 002): 0 for its dataset 1, -1 for its
     dataset 2. jitter: "dlctus" where every frame is rendered. fresh: new train scenes after so many steps, rendered in
@@ -45,7 +45,7 @@ class Data:
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """What all stages share.
+    """Settings that all stages share.
 
     optimizer: of ``essjax.train.OPTIMIZERS``. anneal: the learning rates decay. save_every: seconds between
     checkpoints. average: decay of a moving average of the weights over the steps; None: the last weights. validations:
@@ -144,7 +144,7 @@ COMMON: Table = {
     "stages.steps":              (6,        None,     None),
     "stages.seconds":            (None,     290.0,    None),
 }  # fmt: skip
-"""What every variant begins with."""
+"""Values that every variant begins with."""
 
 SHARED = ("seed", "optimize", "data", "evaluation")
 """Groups that all variants of a run have in common."""
@@ -158,7 +158,7 @@ def make_settings(
     objectives: Mapping[str, Callable] | None = None,
     table: Table | None = None,
 ) -> Settings:
-    """The settings of a variant.
+    """Make the settings of a variant.
 
     Args:
       preset: its name.
@@ -186,13 +186,13 @@ def make_settings(
 
 
 def _blank(kind: type, **values: Any) -> Any:
-    """A dataclass whose other fields are None for now: tables fill them, ``check`` sees which they forget."""
+    """Make a dataclass whose other fields are None for now: tables fill them, ``check`` sees which they forget."""
     return kind(**dict.fromkeys(field.name for field in dataclasses.fields(kind)) | values)
 
 
 @functools.cache
 def arguments(function: Callable) -> type:
-    """A frozen dataclass of those arguments of ``function`` that are settings: plain values that have a default.
+    """Make a frozen dataclass of those arguments of ``function`` that are settings: plain values with a default.
 
     What a ``functools.partial`` has settled is none, nor is ``scale``, which is ``data.scale``.
     """
@@ -212,7 +212,7 @@ def _plain(kind: Any) -> bool:
 
 
 def with_value(settings: Settings, path: str, value: Any) -> Settings:
-    """The settings with another value at ``path``; see the top of the module for what a path is.
+    """Return the settings with another value at ``path``; see the top of the module for what a path is.
 
     Raises:
       ValueError: there is no such setting; the names at that level are listed.
@@ -342,4 +342,4 @@ _BOUNDS = {
     "seed": (0, math.inf), "train_frames": (2, math.inf), "test_frames": (2, math.inf), "clip": (2, math.inf),
     "mip_bias": (-math.inf, math.inf), "average": (0, 1), "warmup": (0, math.inf), "pictures": (0, math.inf),
 }  # fmt: skip
-"""Of settings for which it is not 1 (integers) or 0 (others) and infinity: the least value, and what it is below."""
+"""Bounds other than 1 (integers) or 0 (others) and infinity: the least value, and what it is below."""

@@ -39,16 +39,16 @@ MIN_CROP = 24
 
 
 class Watcher:
-    """What a training tells; this one listens to nothing."""
+    """Listener to a training; this one listens to nothing."""
 
     def on_compile(self, stage: str) -> None:
-        """The step of ``stage`` is about to be compiled, or waited for."""
+        """Hear that the step of ``stage`` is about to be compiled, or waited for."""
 
     def on_step(self, stage: str, step: int, progress: float, terms: dict[str, float]) -> None:
-        """A step is done; progress in [0, 1]."""
+        """Hear that a step is done; progress in [0, 1]."""
 
     def on_validation(self, stage: str, step: int, progress: float, scores: dict[str, float]) -> None:
-        """A validation begins (no scores), or is done."""
+        """Hear that a validation begins (no scores), or is done."""
 
 
 def check_crop(settings: StageSettings, width: int, height: int, scale: int) -> tuple[int, int]:
@@ -83,7 +83,7 @@ def check_batches(dataset: Dataset, settings: Settings, stage: Stage) -> None:
 
 
 def cutter(stage: Stage) -> Callable:
-    """What cuts a stage's clips: those of a recurrent objective follow each other."""
+    """Choose what cuts a stage's clips: those of a recurrent objective follow each other."""
     return successive_clips if isinstance(stage.objective, Recurrent) else clips
 
 
@@ -101,7 +101,7 @@ def _cut(dataset: Dataset, stage: Stage) -> dict[str, Any]:
 
 
 def make_batches(dataset: Dataset, settings: Settings, stage: Stage, *, prefetch: int = 4):
-    """An iterator of clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
+    """Iterate over clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
 
     With ``data.fresh`` the scenes on disk are the first round, and each further one is rendered while the last is
     trained on. ``prefetch`` batches are held ready.
@@ -131,13 +131,13 @@ def initial_variables(member: Member, dataset: Dataset) -> PyTree:
 
 
 def first_batch(dataset: Dataset, settings: Settings, stage: Stage) -> Sequence:
-    """The first one that ``make_batches`` gives."""
+    """Return the first one that ``make_batches`` gives."""
     # Without fresh scenes: the next round would be rendered for nothing.
     return next(make_batches(dataset, with_value(settings, "data.fresh", None), stage, prefetch=1))
 
 
 def initial_state(member: Member, stage: Stage, variables: PyTree, batch: Sequence) -> TrainState:
-    """What ``stage`` starts with: variables of its own and of the stages before it; a history where clips follow.
+    """Make what ``stage`` starts with: variables of its own and of the stages before it; a history where clips follow.
 
     Later stages' variables are not touched (nor saved) by it.
     """
@@ -150,7 +150,7 @@ def initial_state(member: Member, stage: Stage, variables: PyTree, batch: Sequen
 
 
 def make_step(stage: Stage, settings: Settings) -> Callable:
-    """The jitted step of a stage."""
+    """Make the jitted step of a stage."""
     training, options = settings.training, {"compiler_options": settings.compiler_options}
     if training.average is not None:
         options["average"] = training.average
@@ -202,7 +202,7 @@ def train_member(
 
 
 def restore_member(member: Member, dataset: Dataset, variables: PyTree) -> tuple[PyTree, dict[str, Any]]:
-    """The variables of the stages' newest checkpoints, for ``--eval-only``, and how they were trained.
+    """Restore the variables of the stages' newest checkpoints, for ``--eval-only``, and how they were trained.
 
     Args:
       member: that was trained in its folder.

@@ -54,14 +54,14 @@ def _tune_clamp(make: Callable[[str], Method], clips: Sequence[Clip], clamp: str
 
 
 def setting_variables(setting: Setting) -> dict[str, Any]:
-    """The variables of a TAA method with this setting."""
+    """Make the variables of a TAA method with this setting."""
     return {"alpha": jnp.float32(setting.alpha), "sigma": jnp.float32(setting.sigma)}
 
 
 def _best(
     method: Method, clamp: str, settings: list[tuple[float, float]], clips: Sequence[Clip]
 ) -> tuple[Setting, np.ndarray]:
-    """The best of ``settings`` (alpha, sigma), and its PSNR on each clip."""
+    """Return the best of ``settings`` (alpha, sigma), and its PSNR on each clip."""
     # By index: a loop over the clips would hold one while the next is read.
     scores = np.array([_score_grid(method, np.array(settings, np.float32), clips[n]) for n in range(len(clips))])
     top = int(np.argmax(np.nan_to_num(scores.mean(axis=0), nan=-np.inf)))  # argmax takes a NaN for the largest

@@ -31,7 +31,7 @@ class Window(NamedTuple):
 
 
 def windows(dataset: Dataset, settings: Settings, *, native: bool) -> list[Window]:
-    """What is played: of up to ``CLIPS`` clips the first frames that are scored, and as many before as warm up."""
+    """Cut out what is played: of up to ``CLIPS`` clips the first frames that are scored, after those that warm up."""
     source, segments = disk_source(dataset, SPLIT, native=native), dataset.segments(SPLIT)
     chosen = sorted(set(np.linspace(0, len(segments) - 1, CLIPS).round().astype(int).tolist()))
     found = [_window(source, index, dataset.scored(segments[index]), settings.evaluation.warmup) for index in chosen]

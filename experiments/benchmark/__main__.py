@@ -43,7 +43,7 @@ class Command:
 
 
 def parse(arguments: Sequence[str] | None = None) -> Command:
-    """The command line."""
+    """Parse the command line."""
     return parse_as(Command, "benchmark", arguments)
 
 

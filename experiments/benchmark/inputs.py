@@ -62,6 +62,6 @@ def frames(count: int, width: int, height: int) -> list[Frame]:
 
 
 def random_like(shapes: PyTree, seed: int = 0) -> PyTree:
-    """Normal noise for each ``jax.ShapeDtypeStruct``."""
+    """Draw normal noise for each ``jax.ShapeDtypeStruct``."""
     rng = np.random.default_rng(seed)
     return jax.tree.map(lambda leaf: rng.standard_normal(leaf.shape, np.float32).astype(leaf.dtype), shapes)

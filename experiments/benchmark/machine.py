@@ -1,4 +1,4 @@
-"""What the machine can do, measured in the same run: the roofline that rows are compared with."""
+"""Limits of the machine, measured in the same run: the roofline that rows are compared with."""
 
 from typing import Any
 

@@ -68,7 +68,7 @@ class Compilations:
 
 
 def queued_calls() -> int:
-    """Calls per repetition on the default backend."""
+    """Return the calls per repetition on the default backend."""
     return QUEUED.get(jax.default_backend(), 1)
 
 

@@ -1,9 +1,9 @@
-"""What a result file of the benchmark holds, checked before it is written and before it is shown."""
+"""The content of a result file of the benchmark, checked before it is written and before it is shown."""
 
 from typing import Any
 
 SIZE = "960x540"
-"""Of low-resolution frames; results of another have it in their file's name."""
+"""Size of low-resolution frames; results of another have it in their file's name."""
 RESULT = {
     "schema": int, "kind": str, "suite": str, "environment": dict, "machine": dict, "settings": dict, "rows": list,
     "facts": dict,

@@ -15,7 +15,7 @@ COLORS = {
 }  # fmt: skip
 """One colour per class; pixels of none show the reference."""
 WIDTH = 480
-"""Of one map, pixels."""
+"""Width of one map, pixels."""
 
 
 def class_picture(reference: np.ndarray, classes: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -23,7 +23,7 @@ _STOPS = np.array([
 
 
 def color_map() -> np.ndarray:
-    """The look-up table of error maps, uint8 ``[256, 3]``."""
+    """Make the look-up table of error maps, uint8 ``[256, 3]``."""
     position = np.linspace(0, len(_STOPS) - 1, 256)
     return np.stack([np.interp(position, np.arange(len(_STOPS)), _STOPS[:, c]) for c in range(3)], axis=-1).astype(
         np.uint8
@@ -51,13 +51,13 @@ def error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def flicker(now: np.ndarray, before: np.ndarray, reference: np.ndarray, reference_before: np.ndarray) -> np.ndarray:
-    """``|(I_t - I_t-1) - (R_t - R_t-1)|`` ``[H, W]`` of shown images: change over time that the reference lacks."""
+    """Compute ``|(I_t - I_t-1) - (R_t - R_t-1)|`` ``[H, W]`` of shown images: change that the reference lacks."""
     change = resize_nearest(now - before, *reference.shape[:2])
     return np.abs(change - (reference - reference_before)).mean(axis=-1)
 
 
 def colored(values: np.ndarray, gain: float) -> np.ndarray:
-    """A map ``[H, W]`` in colours, uint8 ``[H, W, 3]``; ``1 / gain`` and more is the brightest."""
+    """Show a map ``[H, W]`` in colours, uint8 ``[H, W, 3]``; ``1 / gain`` and more is the brightest."""
     return color_map()[(np.clip(values * gain, 0.0, 1.0) * 255).astype(np.uint8)]
 
 

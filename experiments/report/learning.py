@@ -12,7 +12,7 @@ Line = Sequence[tuple[float, float]]
 
 
 def learning_section(training: Mapping[str, Mapping[str, Any]]) -> str:
-    """The section of the page; empty where nothing was trained.
+    """Make the section of the page; empty where nothing was trained.
 
     Args:
       training: stage -> ``{"loss": [(step, value)], "validated": [{"step", kind: PSNR}]}``.

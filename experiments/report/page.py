@@ -80,7 +80,7 @@ def write_report(
 
 
 def _page_pictures(pictures: Sequence[Picture]) -> tuple[list[dict], int]:
-    """The pictures as the page's script reads them, as many as fit, and how many did not."""
+    """Prepare as many pictures for the page's script as fit, and count those that did not."""
     data, size = [], 0
     for picture in pictures:
         entry = _page_picture(picture)
@@ -176,7 +176,7 @@ def _round(value: Any) -> Any:
 
 
 def _facts(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What made these numbers: preset, environment, times."""
+    """Say what made these numbers: preset, environment, times."""
     environment = dict(metrics.get("environment") or {})
     overrides = " ".join(metrics.get("overrides") or ())
     facts = [("preset", f"{metrics.get('preset', '–')} {overrides}".rstrip())]
@@ -218,7 +218,7 @@ def _table(table: Table) -> str:
 
 
 def _costs(costs: Mapping[str, Mapping[str, Any]]) -> str:
-    """What each method costs, as a table; nothing where it is not known."""
+    """Show what each method costs, as a table; nothing where it is not known."""
     if not costs:
         return ""
     body = []

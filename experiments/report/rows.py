@@ -56,7 +56,7 @@ class Line(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What one resolution and one sequence (or "mean") scored, ``COLUMNS`` per kind; the title says against what."""
+    """Scores at one resolution of one sequence (or "mean"), ``COLUMNS`` per kind; the title says against what."""
 
     title: str
     sequence: str
@@ -65,7 +65,7 @@ class Table(NamedTuple):
 
 
 def shown_value(row: Mapping[str, Any] | None, column: Column) -> float | None:
-    """The number that a cell shows, or None; of the warped error what goes beyond the reference's own."""
+    """Return the number that a cell shows, or None; of the warped error what goes beyond the reference's own."""
     value = None if row is None else row.get(column.key)
     if row is None or value is None:
         return None
@@ -99,7 +99,7 @@ def sequences(metrics: Mapping[str, Any]) -> list[str]:
 def make_table(
     metrics: Mapping[str, Any], resolution: str, sequence: str, references: Mapping[str, str] | None = None
 ) -> Table:
-    """The table of one resolution and one sequence.
+    """Make the table of one resolution and one sequence.
 
     Methods come best first (PSNR on extrapolated frames, else on rendered ones), those in ``references`` last.
 
@@ -139,7 +139,7 @@ def make_table(
 
 
 def _quality(rows: Mapping[tuple[str, str], Mapping[str, Any]], method: str, kinds: list[str]) -> float:
-    """What methods are sorted by."""
+    """Return what methods are sorted by."""
     for kind in reversed(kinds):
         value = rows.get((method, kind), {}).get("psnr")
         if value is not None:
@@ -148,7 +148,7 @@ def _quality(rows: Mapping[tuple[str, str], Mapping[str, Any]], method: str, kin
 
 
 def resolutions(metrics: Mapping[str, Any]) -> list[str]:
-    """The resolutions that were scored, "hr" first."""
+    """List the resolutions that were scored, "hr" first."""
     present = {row["resolution"] for row in metrics["rows"]}
     return [name for name in ("hr", "lr") if name in present]
 

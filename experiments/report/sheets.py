@@ -69,7 +69,7 @@ def _cell(picture: Picture, name: str) -> Image.Image:
 
 
 def _framed(frame: np.ndarray, picture: Picture) -> Image.Image:
-    """The whole frame at the cell's width, the crop marked."""
+    """Draw the whole frame at the cell's width, the crop marked."""
     height, width = frame.shape[:2]
     scale = CELL / width
     method = Image.Resampling.BOX if scale < 1 else Image.Resampling.NEAREST

@@ -45,7 +45,7 @@ def print_table(
 
 
 def _grid(table: Table, count: int) -> RichTable:
-    """The table with the first ``count`` metrics of every kind."""
+    """Make the table with the first ``count`` metrics of every kind."""
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False)
     grid.add_column("method", no_wrap=True)
     for kind in table.kinds:

@@ -12,7 +12,7 @@ for _table in TABLES.values():
 
 
 def get_table(name: str) -> Table:
-    """The table called ``name``.
+    """Find the table called ``name``.
 
     Raises:
       ValueError: unknown; lists the valid names.

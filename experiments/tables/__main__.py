@@ -21,7 +21,7 @@ class TablesOptions(Options):
 
 
 def parse(arguments: Sequence[str] | None = None) -> TablesOptions:
-    """The command line."""
+    """Parse the command line."""
     return parse_as(TablesOptions, "tables", arguments)
 
 

@@ -70,12 +70,12 @@ class Table(NamedTuple):
 
 
 def variants(table: Table) -> list[str]:
-    """The variants behind a table, each once, in its order."""
+    """List the variants that fill a table, each once, in its order."""
     return list(dict.fromkeys(row.variant for row in table.rows.values() if row.variant))
 
 
 def paper_mean(table: Table, row: str, metric: str) -> float | None:
-    """The mean over the paper's scenes, None if it gives none."""
+    """Return the mean over the paper's scenes, None if it gives none."""
     values = [value for value in table.paper.get(row, {}).get(metric, ()) if value is not None]
     return sum(values) / len(values) if values else None
 
@@ -145,7 +145,7 @@ def agreement(table: Table, ours: Mapping[str, Mapping[str, float | None]], metr
 
 
 def verdict(table: Table, ours: Mapping[str, Mapping[str, float | None]]) -> str:
-    """One sentence per measured metric: does the paper's order hold?"""
+    """Say in one sentence per measured metric whether the paper's order holds."""
     sentences = []
     for name, metric in table.metrics.items():
         if metric.key is None:
@@ -162,7 +162,7 @@ def verdict(table: Table, ours: Mapping[str, Mapping[str, float | None]]) -> str
 
 
 def markdown(table: Table, ours: Mapping[str, Mapping[str, float | None]]) -> str:
-    """The table: per metric the paper's scenes, their mean, and ours; then the verdict."""
+    """Write the table: per metric the paper's scenes, their mean, and ours; then the verdict."""
     several = len(table.scenes) > 1
     heads = []
     for name in table.metrics:

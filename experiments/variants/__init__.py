@@ -1,4 +1,4 @@
-"""What ``--variant`` can name, by paper, and what a run compares it with."""
+"""Variants that ``--variant`` can name, by paper, and what a run compares them with."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ BASELINES = ("warp", "warp-blur", "extrass-w", "bilinear", "bicubic", "jau", "ta
 
 
 def get_variant(name: str) -> Variant:
-    """The variant called ``name``.
+    """Find the variant called ``name``.
 
     Raises:
       ValueError: unknown; lists the valid names.
@@ -33,7 +33,7 @@ def get_variant(name: str) -> Variant:
 
 
 def trained_as(name: str) -> str:
-    """The variant whose training and settings ``name`` takes: its own, unless only its steps differ."""
+    """Name the variant whose training and settings ``name`` takes: its own, unless only its steps differ."""
     return get_variant(name).weights or name
 
 

@@ -1,4 +1,4 @@
-"""What a variant is: a method with its training, and what ``docs/methods.md`` says about it."""
+"""Variants: a method with its training, and what ``docs/methods.md`` says about it."""
 
 import dataclasses
 import inspect
@@ -62,7 +62,7 @@ class StageRecipe:
     vgg: Callable[[str], Any] | None = None
 
     def stage(self, name: str, settings: Settings, whole: Method) -> Stage:
-        """The stage called ``name`` of a variant whose method is ``whole``."""
+        """Make the stage called ``name`` of a variant whose method is ``whole``."""
         method = self.method(settings) if self.method else whole
         given = {**vars(settings.stages[name].loss), **self.given(settings)}
         if self.vgg and settings.training.vgg:
@@ -73,7 +73,7 @@ class StageRecipe:
 
 
 class Page(NamedTuple):
-    """What docs/methods.md says about a method and cannot be computed.
+    """Parts of docs/methods.md about a method that cannot be computed.
 
     Attributes:
       paper: where it comes from.
@@ -89,7 +89,7 @@ class Page(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a variant measures beyond images: ``scores`` for ``metrics.json``, ``remark`` for the reader."""
+    """Measurements of a variant beyond images: ``scores`` for ``metrics.json``, ``remark`` for the reader."""
 
     scores: Mapping[str, Any]
     remark: str

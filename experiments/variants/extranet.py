@@ -9,7 +9,7 @@ from essjax.train import cosine, extranet_objective
 from experiments.variants.base import Page, StageRecipe, Variant
 
 EPOCHS, FIRST_EPOCHS = 150, 20
-"""Of the paper: all (Table 3), and the first ones, after which the cosine decay starts (section 4.6)."""
+"""Epochs of the paper: all (Table 3), and the first ones, after which the cosine decay starts (section 4.6)."""
 DECAY = partial(cosine, start=FIRST_EPOCHS / EPOCHS)
 PRESETS = {
     #                             smoke quick paper

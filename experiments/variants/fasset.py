@@ -10,7 +10,7 @@ from experiments.variants.extranet import DECAY
 from experiments.variants.nsrr import features
 
 EPOCHS, EPOCHS_PER_HALVING = 150, 30
-"""Of the paper (section 3.4)."""
+"""Numbers of the paper (section 3.4)."""
 PRESETS = {
     #                           smoke quick  paper
     "method.width":            (8,    12,    24),

@@ -9,7 +9,7 @@ from essjax.train.objectives.nsrr import VGG_LAYERS
 from experiments.variants.base import Page, StageRecipe, Variant
 
 features = partial(vgg16_features, layers=VGG_LAYERS)
-"""Of its perceptual term."""
+"""Features of its perceptual term."""
 
 VARIANTS = {
     "nsrr": Variant(

@@ -1,4 +1,4 @@
-"""What people would otherwise run: the same warps and networks in PyTorch, eager and compiled.
+"""Peers that people would otherwise run: the same warps and networks in PyTorch, eager and compiled.
 
 Written for the comparison, with our conventions and our weights; nothing is timed before its output equals ours. Needs
 the extra ``bench`` (``pip install -e '.[bench]'``); without it the benchmark shows essjax alone.
@@ -42,7 +42,7 @@ def installed() -> bool:
 
 
 def find(name: str) -> Peer | None:
-    """The peer of a case, by its name without the size."""
+    """Find the peer of a case, by its name without the size."""
     from experiments.benchmark.peers import networks, warps
 
     return {**warps.PEERS, **networks.PEERS}.get(name.split(",")[0])

@@ -40,7 +40,7 @@ def build(folder: Path) -> Callable:
 
 
 def rows(case: Case, ours: np.ndarray, repetitions: int) -> Iterator[dict[str, Any]]:
-    """A row for the guided warp where there is a compiler; its arguments must use the default sigmas."""
+    """Time the guided warp where there is a compiler; its arguments must use the default sigmas."""
     if not compiler():
         return
     arguments = [np.ascontiguousarray(a, np.float32) for a in case.arguments]

@@ -56,7 +56,7 @@ def splat(image: torch.Tensor, motion: torch.Tensor) -> torch.Tensor:
 
 
 def guided_warp(radiance, guide_previous, guide, motion, offsets, sigma):
-    """The stacked form: 33 candidates gathered, the four cheapest by ``topk``; all ``[H, W, C]``."""
+    """Warp in the stacked form: 33 candidates gathered, the four cheapest by ``topk``; all ``[H, W, C]``."""
     height, width, channels = guide.shape
     x, y = _centers(height, width, guide)
     x, y = x + motion[..., 0], y + motion[..., 1]

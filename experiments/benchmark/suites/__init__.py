@@ -9,7 +9,7 @@ Row = dict[str, Any]
 
 
 class Options(NamedTuple):
-    """What the command line asks for.
+    """All that the command line asks for.
 
     Attributes:
       width: of low-resolution frames, pixels.

@@ -82,7 +82,7 @@ def forwards(width: int, height: int) -> list[Forward]:
 
 
 def case(forward: Forward, dtype: str) -> Case:
-    """The forward pass on noise, products in ``dtype``; what is compared with others is the first of its outputs."""
+    """Make a case of the forward pass on noise, products in ``dtype``; its first output is compared with others."""
     variables = jax.jit(lambda key: forward.network.init(key, *forward.init))(jax.random.key(0))
     noise = np.random.default_rng(0)  # heads start at zero, statistics at 0 and 1: a wrong peer would not be found out
     variables = jax.tree.map(lambda x: x + 0.02 * noise.standard_normal(x.shape, np.float32), variables)

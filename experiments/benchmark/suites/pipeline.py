@@ -26,7 +26,7 @@ RESIDENT = "essjax, frames on the device"
 
 
 def streamed_methods() -> dict[str, Method]:
-    """The parts of ExtraSS as its paper's Table 4 times them, other methods' whole steps, and TAAU."""
+    """Make the parts of ExtraSS as its paper's Table 4 times them, other methods' whole steps, and TAAU."""
     return {
         "extrass-w": methods.extrass_w(),
         "extrass-e": methods.extrass_e(),
@@ -86,7 +86,7 @@ def largest_difference(method: Method, frames: list) -> float:
 
 
 def rows(options: Options) -> Iterator[Row]:
-    """A row per method, kind of frame and compute type: latencies of ``options.frames`` frames."""
+    """Yield a row per method, kind of frame and compute type: latencies of ``options.frames`` frames."""
     frames = inputs.frames(DISTINCT, options.width, options.height)
     for name, method in streamed_methods().items():
         if not options.wanted(name):

@@ -14,7 +14,7 @@ SAMPLES = 64
 
 
 def rows(options: Options) -> Iterator[Row]:
-    """References at a quarter of the size of frames, 64 samples per pixel; and frames with all buffers."""
+    """Time references at a quarter of the size of frames, 64 samples per pixel; and frames with all buffers."""
     width, height = max(options.width // 4, 32), max(options.height // 4, 24)
     for family in FAMILIES:
         scene = make_scene(family, 0, 2)
@@ -32,7 +32,7 @@ def rows(options: Options) -> Iterator[Row]:
 
 
 def _row(name: str, call, options: Options, work: dict[str, float]) -> Row:
-    """Rendering calls many jitted pieces from Python threads: it is timed from outside, as its users see it."""
+    """Time rendering from outside, as its users see it: it calls many jitted pieces from Python threads."""
     with Compilations() as building:
         call()
     seconds = time_calls(lambda: jax.block_until_ready(call()), options.repetitions, warm_up=1)

@@ -28,13 +28,13 @@ CROPS = (48, 64, 96)
 """Sides of square crops, LR pixels."""
 BATCH = 2
 WIDTH = 24
-"""Of the networks: the paper preset's."""
+"""Width of the networks: the paper preset's."""
 LOADED_STEPS = 40
 DEFAULT = "a step of the default run:"
 
 
 def _clip(length: int, width: int, height: int, batch: int = BATCH) -> Sequence:
-    """A batch of clips ``[T, B, H, W, C]`` of synthetic frames."""
+    """Make a batch of clips ``[T, B, H, W, C]`` of synthetic frames."""
     frames = [inputs.frame(width, height, 100 * n) for n in range(length)]
     stacked: Frame = jax.tree.map(lambda *leaves: np.stack(leaves).repeat(batch, axis=1), *frames)
     reference = np.asarray(stacked.color).repeat(2, axis=-3).repeat(2, axis=-2)
@@ -51,12 +51,12 @@ def _wide() -> Stage:
 
 
 def _step_case(length: int, side: int) -> Case:
-    """The whole train step: both rollouts, all losses, gradient, Adam."""
+    """Make a case of the whole train step: both rollouts, all losses, gradient, Adam."""
     return _case(f"train step, {length} frames of {side}x{side}, batch {BATCH}", _wide(), _clip(length, side, side))
 
 
 def _default_case(stage: Stage) -> Case:
-    """The same of a stage of the default run, at its shapes."""
+    """Make the same of a stage of the default run, at its shapes."""
     settings = stage.settings
     return _case(f"{DEFAULT} {stage.name}", stage, _clip(settings.clip, *settings.crop, settings.batch))
 
@@ -89,7 +89,7 @@ def _unrolled_case(method: Method, *, remat: bool, gradient: bool) -> Case:
 
 
 def rows(options: Options) -> Iterator[Row]:
-    """Steps of the default run, of three lengths and three sizes, unrolled gradients, training that reads its clips."""
+    """Time steps of the default run, of three lengths and sizes, unrolled gradients, training that reads its clips."""
     repetitions = options.repetitions
     for stage in _extrass().stages:
         yield measure(_default_case(stage), repetitions)
@@ -103,7 +103,7 @@ def rows(options: Options) -> Iterator[Row]:
 
 
 def _loaded(*overrides: str) -> Row:
-    """A training loop on clips from disk, or fresh ones: what share of the time the step waits for its batch."""
+    """Time training on clips from disk, or fresh ones, and the share in which the step waits for its batch."""
     member = _extrass(*overrides)
     settings, stage = member.settings, member.stages[-1]
     data, training = settings.data, stage.settings
