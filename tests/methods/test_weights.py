@@ -14,6 +14,8 @@ from essjax import methods
 from essjax.frames import example_frame
 from essjax.interfaces import Method
 from essjax.methods import registry, weights
+from experiments.members import settings_of
+from experiments.variants import VARIANTS
 
 SMALL = methods.taau(scale=3, alpha=0.25)
 
@@ -142,3 +144,9 @@ def test_files_of_others_and_methods_of_others(tmp_path):
             methods.load(path)
     with pytest.raises(ValueError, match="taau: expected a method made by a factory of essjax.methods, got"):
         methods.save(tmp_path / "mine.safetensors", SMALL._replace(recipe=None), {})
+
+
+@pytest.mark.parametrize("name", sorted(VARIANTS))
+def test_the_method_of_every_variant_is_made_again(name):
+    method = VARIANTS[name].method(settings_of(name, "smoke"))
+    assert weights._made(weights._described(method)).info == method.info
