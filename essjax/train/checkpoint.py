@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 
 from essjax.typing import PyTree
@@ -60,7 +62,9 @@ class Checkpoints:
                 f"{self.path}: checkpoint {step} does not fit this configuration ({str(error).splitlines()[0]}). "
                 "Use the settings that it was trained with, or another --out."
             ) from error
-        return restored["state"], restored["progress"]
+        # Copied from the host: orbax ties arrays to their device, which is another program to JAX, compiled once more.
+        state = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), restored["state"])
+        return state, restored["progress"]
 
     def close(self) -> None:
         """Release the manager's threads."""

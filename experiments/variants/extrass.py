@@ -10,7 +10,7 @@ FRNET = {
     #                       smoke quick paper
     "frnet.learning_rate": (1e-3, 1e-3, 1e-4),
     "frnet.steps":         (4,    None, 100 * 900),
-    "frnet.seconds":       (None, 45.0, None),
+    "frnet.seconds":       (None, 30.0, None),
 }  # fmt: skip
 LOW = {"width": "frnet_width"}
 """The low-resolution part's arguments, in the whole."""
@@ -36,7 +36,7 @@ VARIANTS = {
             "extrassnet.batch":                 (2,    4,     12),
             "extrassnet.learning_rate":         (3e-3, 3e-3,  4e-4),
             "extrassnet.steps":                 (6,    None,  120 * 600),
-            "extrassnet.seconds":               (None, 245.0, None),
+            "extrassnet.seconds":               (None, 260.0, None),
             "extrassnet.loss.occlusion_weight": (0.3,  0.3,   1.0),
             "extrassnet.loss.temporal_weight":  (0.1,  0.1,   1.0),
         },

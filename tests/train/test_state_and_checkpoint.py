@@ -210,6 +210,18 @@ def test_round_trip_and_retention(tmp_path):
     assert sorted(path.name for path in (tmp_path / "a" / "b").glob("[0-9]*")) == ["2", "5"]
 
 
+def test_a_restored_state_is_another_program_to_nobody(tmp_path):
+    """Arrays that are committed to a device lower to another program: a resumed run would compile its step again."""
+    fresh, clip = tiny_run.initial_state(), next(tiny_run.tiny_batches())
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(0, fresh, {})
+    restored, _ = checkpoints.restore(fresh)
+    checkpoints.close()
+    assert not any(leaf.committed for leaf in jax.tree.leaves(restored))
+    texts = {tiny_run.tiny_step().lower(state, clip, 0.1).as_text() for state in (fresh, restored)}
+    assert len(texts) == 1
+
+
 def test_no_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     message = f"{tmp_path}: expected a checkpoint, found none. Train first, or check --out."
