@@ -53,7 +53,7 @@ class Clip(NamedTuple):
         return f"{self.split}-{self.family}-{self.seed:04d}"
 
     def rendered(self, rendering: Rendering) -> Rendering:
-        """``rendering`` with what this clip says of it."""
+        """Adapt ``rendering`` to what this clip says of it."""
         return rendering._replace(spp=self.spp, native=self.native)
 
 

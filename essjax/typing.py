@@ -32,7 +32,7 @@ Resized = Float[Array, "... H W c"]
 Places = Float[Array, "... H W 2"]
 """Positions in, or motion on the pixels of, an image of another size."""
 Guide = Float[Array, "... h w g"]
-"""What tells surfaces apart, pixel by pixel: other channels than the image it goes with."""
+"""Channels that tell surfaces apart, pixel by pixel: as many as they like, beside an image of others."""
 Level = Float[Array, "... _ _ _"]
 """One of several images of different sizes and channels."""
 Values = Float[Array, "..."]

@@ -41,7 +41,7 @@ def validate(content: Sequence, where: str) -> None:
 
 
 def describe(content: Sequence, name: str, source: Mapping[str, Any]) -> SequenceInfo:
-    """What a sequence of such frames looks like.
+    """Describe what a sequence of such frames looks like.
 
     Raises:
       ValueError: reference or native frame have the wrong size.
@@ -66,7 +66,7 @@ def describe(content: Sequence, name: str, source: Mapping[str, Any]) -> Sequenc
 
 
 def _images(content: Sequence) -> dict[str, Any]:
-    """The LR images of a frame, by name."""
+    """Collect the LR images of a frame, by name."""
     masks = {name: getattr(content, name) for name in ("valid", "steady")}
     return {**frame_images(content.frames), **{name: mask for name, mask in masks.items() if mask is not None}}
 

@@ -43,7 +43,7 @@ KNOWN = {
 
 
 class Guess(NamedTuple):
-    """What is found.
+    """The readings that were found.
 
     Attributes:
       preset: of a producer that is known by its files; "generic": the recipe says it.
@@ -107,7 +107,7 @@ def guess_recipe(source: Path) -> Guess:
 
 @contextmanager
 def _few_frames(source: Path, inventory: Inventory) -> Iterator[Path]:
-    """A dump of links to the first frames of the first sequence."""
+    """Make a dump of links to the first frames of the first sequence."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / source.resolve().name
         wanted = [frames[n] for frames in inventory.files.values() for n in inventory.numbers[:FRAMES]]
@@ -177,7 +177,7 @@ def _find_motion(draft: Draft, dataset: Dataset, frames: list[Step]) -> None:
 
 
 def _winner(comparison: Comparison) -> tuple[int, float]:
-    """The reading whose least margin over the others is largest, and that margin, dB."""
+    """Return the reading whose least margin over the others is largest, and that margin, dB."""
     n = len(comparison.names)
     worst = [
         min((comparison.margin(a, b) for b in range(n) if comparison.decidable(a, b)), default=-np.inf)
@@ -298,7 +298,7 @@ def _weigh(draft: Draft, verdicts: Mapping[str, str]) -> None:
 
 
 def to_toml(content: Mapping[str, Any], notes: Mapping[str, tuple[str, str]]) -> str:
-    """A recipe as TOML, with a comment on what is not certain and why."""
+    """Write a recipe as TOML, with a comment on what is not certain and why."""
 
     def value(item: Any) -> str:
         if isinstance(item, bool):

@@ -80,7 +80,7 @@ class SequenceWriter:
 
     @property
     def folder(self) -> Path:
-        """Of the sequence."""
+        """Return the folder of the sequence."""
         return self.root / self.name
 
     def _check_source(self, found: Mapping[str, Any]) -> None:
@@ -169,7 +169,7 @@ class SequenceWriter:
         return True
 
     def describe(self, number: int, content: Sequence) -> SequenceInfo:
-        """What a sequence of such frames looks like; nothing is written.
+        """Describe what a sequence of such frames looks like; nothing is written.
 
         Raises:
           ValueError: invalid content.
@@ -181,7 +181,7 @@ class SequenceWriter:
     def prepare(
         self, number: int, content: Sequence, *, notes: Mapping[str, Any] | None = None, made_from: str = ""
     ) -> PreparedFrame:
-        """The first half of ``write``: write the images of a frame that ``describe`` accepts.
+        """Do the first half of ``write``: write the images of a frame that ``describe`` accepts.
 
         Threads may prepare frames side by side.
 
@@ -201,7 +201,7 @@ class SequenceWriter:
         self.skipped[number] = {"number": number, "reason": reason, "made_from": made_from}
 
     def commit(self, prepared: PreparedFrame, *, cut: bool = False, save: bool = True) -> None:
-        """The second half of ``write``: list a prepared frame; one thread, in the order of the frames.
+        """Do the second half of ``write``: list a prepared frame; one thread, in the order of the frames.
 
         Args:
           prepared: from ``prepare``.

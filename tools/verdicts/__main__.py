@@ -16,7 +16,7 @@ PAGE = Path(__file__).parent / "RESULTS.md"
 
 
 def wrongs(dataset: Dataset) -> list[Finding]:
-    """Findings that say "wrong"."""
+    """List the findings that say "wrong"."""
     return [finding for finding in check_dataset(dataset, pairs=0).findings if finding.verdict == "wrong"]
 
 
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def page(clips, corruptions, table, alarms, details) -> str:
-    """The results as Markdown."""
+    """Write the results as Markdown."""
     visible = [v for v in table.values() if v != SILENT]
     named = visible.count(RIGHT)
     lines = [

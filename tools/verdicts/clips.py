@@ -42,7 +42,7 @@ def fog(b: Builder) -> None:
 
 
 def spin(b: Builder) -> None:
-    """The camera turns by a tenth of the picture and more per frame."""
+    """Turn the camera by a tenth of the picture and more per frame."""
     _floor(b)
     for k in range(16):
         angle = 2 * np.pi * k / 16
@@ -57,7 +57,7 @@ def spin(b: Builder) -> None:
 
 
 def still_camera(b: Builder) -> None:
-    """A camera on a tripod, one object that crosses the picture and one that turns in place."""
+    """Put a camera on a tripod; one object crosses the picture and one turns in place."""
     _floor(b)
     b.rect(presets.bricks(COLORS[2], frequency=0.9), (0, 3, -10), 14, 3)
     b.box(presets.stripes(COLORS[1], COLORS[4]), _walk(b, (-2.2, 1.0, -5.0), (0.22, 0.08, 0.0)), (0.8, 0.7, 0.6))
@@ -90,7 +90,7 @@ def close_up(b: Builder) -> None:
 
 
 def night(b: Builder) -> None:
-    """A dark street: lamps and signs that outshine everything, a black sky, most pixels nearly black."""
+    """Build a dark street: lamps and signs that outshine everything, a black sky, most pixels nearly black."""
     b.set_sky(**DARK)
     b.rect(presets.tiles(presets.shade(COLORS[4], 0.4), (0.03, 0.03, 0.03)), (0, 0, -8), 20, 20, FLOOR)
     for k in range(6):
@@ -106,7 +106,7 @@ def night(b: Builder) -> None:
 
 
 def deforming(b: Builder) -> None:
-    """A cloth that waves in the wind, one object whose parts all move in their own way, before plain sky and ground."""
+    """Build a cloth that waves in the wind, all its parts in their own way, before plain sky and ground."""
     b.set_sky(clouds=0.0, ambient=0.5)
     b.rect(presets.stone(COLORS[4], COLORS[2]), (0, 0, -8), 20, 20, FLOOR)
     cloth, strips = b.new_id(), 24
@@ -143,7 +143,7 @@ CLIPS: dict[str, Callable[[], Scene]] = {
 
 
 def render(name: str, folder: Path, *, width: int = WIDTH, height: int = HEIGHT, spp: int = SPP) -> Dataset:
-    """The dataset of a clip, as an import would leave it: without the masks that only the renderer knows."""
+    """Render a clip's dataset as an import would leave it: without the masks that only the renderer knows."""
     sequence = render_sequence(CLIPS[name](), width, height, scale=2, spp=spp)
     write_sequence(folder, "clip", dataclasses.replace(sequence, valid=None, steady=None))
     return write_dataset(folder, {"test": ["clip"]})

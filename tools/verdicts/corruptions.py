@@ -14,7 +14,7 @@ NEAR = 0.1
 
 
 class Corruption(NamedTuple):
-    """What breaks a sequence.
+    """A way to break a sequence.
 
     Attributes:
       apply: ``sequence -> sequence``, leaves ``[T, H, W, C]``.
@@ -59,7 +59,7 @@ def _jitter(scale: float, *fixes: str) -> Corruption:
 
 
 def _reversed_as_forward(sequence: Sequence) -> Sequence:
-    """A reversed infinite depth, d = near / z, decoded as if it were forward, z = near / (1 - d)."""
+    """Decode a reversed infinite depth, d = near / z, as if it were forward, z = near / (1 - d)."""
     stored = NEAR / sequence.frames.gbuffers.depth
     return _buffers(sequence, depth=(NEAR / np.maximum(1 - stored, 1e-6)).astype(np.float32))
 
@@ -78,7 +78,7 @@ def _normals(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Sequence],
 
 
 def _still_object(sequence: Sequence) -> Sequence:
-    """The largest object that moves, without motion."""
+    """Take the motion from the largest object that moves."""
     ids = sequence.frames.gbuffers.stencil
     lengths = np.linalg.norm(sequence.frames.motion, axis=-1, keepdims=True)
     moved = {i: float(lengths[1:][ids[1:] == i].sum()) for i in np.unique(ids[ids > 0])}

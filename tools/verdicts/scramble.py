@@ -81,7 +81,7 @@ def pack(values: np.ndarray, count: int, low: int, high: int) -> np.ndarray:
 
 
 def images_of(sequence: Sequence, t: int, lot: Lot) -> dict[str, np.ndarray]:
-    """The images of a frame in the conventions of a lot."""
+    """Give the images of a frame the conventions of a lot."""
     frames, buffers = sequence.frames, sequence.frames.gbuffers
     height, width = frames.motion.shape[1:3]
     factor = {"pixels": (1, 1), "uv": (width, height), "ndc": (width / 2, height / 2)}[lot.unit]
@@ -201,7 +201,7 @@ def _said(lot: Lot) -> str:
 
 
 def page(tally: Counter, wrong: list[str], count: int) -> str:
-    """The results as Markdown."""
+    """Write the results as Markdown."""
     parts = list(dict.fromkeys(part for part, _, _ in tally))
     cell = lambda part, sure: f"{tally[part, sure, True]} of {tally[part, sure, True] + tally[part, sure, False]}"
     false = sum(n for (_, sure, right), n in tally.items() if sure == CERTAIN and not right)

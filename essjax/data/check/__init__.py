@@ -22,7 +22,7 @@ __all__ = ["VERDICTS", "CheckReport", "Finding", "check_dataset"]
 
 @dataclasses.dataclass(frozen=True)
 class CheckReport:
-    """What ``check_dataset`` found.
+    """The findings of ``check_dataset``.
 
     Attributes:
       findings: one per check.
@@ -98,7 +98,7 @@ def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
 
 
 def _judge_with_each_alone(checks: Mapping[str, _Checks], info: SequenceInfo) -> list[Finding]:
-    """The findings over all sequences together, and where one is wrong in its own way, that of this one."""
+    """Judge all sequences together, and where one is wrong in its own way, take that one's finding."""
     findings = _judge(list(checks.values()), info)
     alone = {name: _judge([check], info) for name, check in checks.items()}
     for row, finding in enumerate(findings):

@@ -16,7 +16,7 @@ DIFFERENT = 0.25
 ENOUGH = 400
 """Pixels, over all frames, in which two readings must differ."""
 PIXELS = 65536
-"""Of larger frames only every second, third, ... row and column is compared."""
+"""Pixels of the frames that are compared in full; of larger ones every second, third, ... row and column is."""
 REGION, CLEAR = 40, 0.2
 """Pixels that a part of the picture needs to have an opinion, and dB that make one."""
 AGREEMENT, WORSE, SUBSTANTIAL = 0.75, 2.0, 0.08
@@ -119,7 +119,7 @@ class Comparison:
         return decibel(self.error[a, b], self.error[b, a]) if self.decidable(a, b) else 0.0
 
     def best(self) -> int:
-        """The stated reading if none beats it; else, of those that do, the first unbeaten or least beaten one."""
+        """Return the stated reading if none beats it; else, of those that do, the first un- or least beaten one."""
         n = len(self.names)
         better = [a for a in range(1, n) if self.margin(a, 0) >= MARGIN]
         worst = {a: min(self.margin(a, b) for b in range(n) if b != a) for a in better}
@@ -127,12 +127,12 @@ class Comparison:
         return unbeaten[0] if unbeaten else max(better, key=lambda a: worst[a], default=0)
 
     def rivals(self) -> list[int]:
-        """The readings that can be told from the stated one, closest first."""
+        """List the readings that can be told from the stated one, closest first."""
         return sorted((b for b in range(1, len(self.names)) if self.decidable(0, b)), key=lambda b: self.margin(0, b))
 
 
 def total(comparisons: Iterable[Comparison]) -> Comparison:
-    """The comparison over all of several sequences."""
+    """Add the comparisons of several sequences up."""
     comparisons = list(comparisons)
     result = Comparison(comparisons[0].names)
     result.count = np.sum([c.count for c in comparisons], axis=0)
@@ -153,7 +153,7 @@ def judge(
     right: int | None = None,
     proof: str = "",
 ) -> Finding:
-    """The verdict over several sequences together.
+    """Judge several sequences together.
 
     Args:
       check: name of the row.

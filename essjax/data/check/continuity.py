@@ -24,7 +24,7 @@ NO_CUT = 0.8
 
 @dataclasses.dataclass
 class ContinuityCheck:
-    """What the pairs of one sequence show; lists of "sequence frame"."""
+    """Signs of cuts and repeats in the pairs of one sequence; lists of "sequence frame"."""
 
     duplicates: list[str] = dataclasses.field(default_factory=list)
     duplicate_references: list[str] = dataclasses.field(default_factory=list)
@@ -73,7 +73,7 @@ def _moves(step: Step) -> bool:
 
 
 def judge_continuity(checks: Sequence[ContinuityCheck]) -> list[Finding]:
-    """Findings about duplicated frames and about cuts."""
+    """Judge duplicated frames and cuts."""
     gather = lambda field: [where for check in checks for where in getattr(check, field)]
     pairs, marked = (sum(getattr(check, field) for check in checks) for field in ("pairs", "marked"))
     return [

@@ -1,4 +1,4 @@
-"""What a check says: a verdict, why, and what to do about it."""
+"""Findings: a verdict, why, and what to do about it."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -27,6 +27,6 @@ class Finding:
 
 
 def some(items: Iterable, limit: int = 4) -> str:
-    """``"a, b, c, d and 3 more"``."""
+    """List a few: ``"a, b, c, d and 3 more"``."""
     names = [str(item) for item in items]
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")

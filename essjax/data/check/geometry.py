@@ -1,4 +1,4 @@
-"""Depth, normals and cameras: do they belong together, and does what hides lie in front of what is hidden?"""
+"""Depth and cameras: whether they belong together, and what hides lies in front of what is hidden."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -135,9 +135,9 @@ def normal_defects(normal: np.ndarray, camera: Camera | None) -> dict[str, np.nd
 
 
 def occlusion_order(step: Step, lookup: np.ndarray) -> dict[str, int]:
-    """Where two surfaces of this frame come from one pixel of the frame before: is the one it shows the nearer one?
+    """Ask of pixels that two surfaces of this frame come from whether the one that they show is the nearer one.
 
-    Which one it shows, colour says. Depths of one frame are compared, so a moving camera does not matter.
+    Colour says which one it shows. Depths of one frame are compared, so a moving camera does not matter.
 
     Args:
       step: with a frame before.
@@ -279,6 +279,6 @@ def _judge_normals(checks: Sequence[GeometryCheck], depth: Finding) -> Finding:
 
 
 def judge_geometry(checks: Sequence[GeometryCheck], *, motion_wrong: bool) -> list[Finding]:
-    """Findings about depth, cameras and normals."""
+    """Judge depth, cameras and normals."""
     depth = _judge_depth(checks, motion_wrong)
     return [depth, _judge_cameras(checks, depth, motion_wrong), _judge_normals(checks, depth)]

@@ -43,7 +43,7 @@ ABSENT = (
 
 
 def matrices(size: tuple[int, int]) -> dict[str, np.ndarray]:
-    """Reading -> the matrix that makes it of the jitter that is stated; ``size`` is height and width."""
+    """Map each reading to the matrix that makes it of the stated jitter; ``size`` is height and width."""
     height, width = size
     of = lambda a, b, c, d: np.array([[a, b], [c, d]], np.float32)
     return {
@@ -218,7 +218,7 @@ def _judge_against(checks: Sequence[JitterCheck]) -> Finding:
 
 
 def _around(surface: np.ndarray, jitter: np.ndarray) -> np.ndarray:
-    """A surface of errors moved such that the stated position is in its middle."""
+    """Move a surface of errors such that the stated position is in its middle."""
     rows, columns = np.mgrid[: len(SHIFTS), : len(SHIFTS)].astype(float)
     return map_coordinates(surface, [rows + jitter[1] / SHIFT_STEP, columns + jitter[0] / SHIFT_STEP], mode="nearest")
 
@@ -247,7 +247,7 @@ def _jittered(checks: Sequence[JitterCheck]) -> bool:
 
 
 def judge_against(checks: Sequence[JitterCheck], scale: int, *, own_reference: bool = False) -> tuple[Finding, Finding]:
-    """Findings about jitter and a constant shift, frames against references.
+    """Judge jitter and a constant shift, frames against references.
 
     Args:
       checks: one per sequence.
@@ -265,7 +265,7 @@ def judge_against(checks: Sequence[JitterCheck], scale: int, *, own_reference: b
 
 
 def judge_between(checks: Sequence[JitterCheck], *, motion_wrong: bool, against: Finding) -> Finding:
-    """The finding about jitter from frame to frame; ``against`` is that of frames against references."""
+    """Judge jitter from frame to frame; ``against`` is the finding of frames against references."""
     if not _jittered(checks):
         return Finding(ROWS[1], "not decidable", NO_JITTER)
     if motion_wrong:

@@ -22,7 +22,7 @@ ROWS = ("motion, references", "motion, rendered frames")
 
 
 class Look(NamedTuple):
-    """What the readings of one pair give.
+    """The readings of one pair and what they give.
 
     Attributes:
       motions: ``[N, H, W, 2]`` each reading's motion, pixels of the rendered frame; NaN if there is no such reading.
@@ -133,7 +133,7 @@ class MotionCheck:
 
     @property
     def psnr(self) -> tuple[float, float]:
-        """Of the reference warped as stated and not at all, on pixels that the frame before shows, toned; dB."""
+        """Score the reference warped as stated and not at all, on pixels that the frame before shows, toned; dB."""
         stated, none = -10 * np.log10(np.maximum(self.squares / max(self.pixels, 1), 1e-10))
         return float(stated), float(none)
 
@@ -146,7 +146,7 @@ def rendered_errors(step: Step, lookup: np.ndarray) -> np.ndarray:
 
 
 def right_reading(checks: Sequence[MotionCheck], proved: int | None) -> tuple[int | None, str]:
-    """The reading that is right, if something knows it that does not lie, and what that is.
+    """Return the reading that is right, if something knows it that does not lie, and what that is.
 
     Cameras and depth prove a convention on what stands still, and a convention is one for the whole picture; else base
     colour and normals, which move with the surfaces, may.
@@ -171,7 +171,7 @@ def judge_motion(
     references_jittered: bool = False,
     proved: int | None = None,
 ) -> list[Finding]:
-    """Findings about motion: against the references, and against the rendered frames.
+    """Judge motion: against the references, and against the rendered frames.
 
     Args:
       checks: one per sequence.

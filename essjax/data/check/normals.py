@@ -1,4 +1,4 @@
-"""Normals: do they stand on the surfaces that depth and cameras describe, and if not, how were they meant?"""
+"""Normals: whether they stand on the surfaces of depth and cameras, and if not, how they were meant."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ FIXES = {
 
 
 def readings(normal: np.ndarray, pose: np.ndarray) -> dict[str, list[np.ndarray]]:
-    """Reading -> what the normals ``[n, 3]`` then are; two candidates where a length is lost."""
+    """Map each reading to what the normals ``[n, 3]`` then are; two candidates where a length is lost."""
     x, y, z = normal.T
     total = normal.sum(axis=-1, keepdims=True)
     with np.errstate(invalid="ignore"):
@@ -79,7 +79,7 @@ class NormalCheck:
 
 
 def judge_directions(checks: Sequence[NormalCheck]) -> Finding | None:
-    """A finding if the normals do not fit the surfaces; None if they do, or nothing can tell."""
+    """Judge whether the normals fit the surfaces; None if they do, or nothing can tell."""
     names = [name for name in FIXES if any(name in check.cosines for check in checks)]
     if not names:
         return None

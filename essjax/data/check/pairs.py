@@ -62,7 +62,7 @@ class Step:
 
 
 def choose(info: SequenceInfo, pairs: int) -> list[int]:
-    """Indices of the frames to look at: the first, and up to ``pairs`` later ones, spread; all if 0.
+    """Choose the frames to look at: the first, and up to ``pairs`` later ones, spread; all if 0.
 
     Half of them are odd and half are even, each in its part of the clip at a place that never repeats: even spacing
     would see only one phase of a jitter that changes every second frame, or of any other period.

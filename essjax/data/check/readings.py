@@ -97,5 +97,5 @@ def motions_of(step: Step) -> dict[str, np.ndarray]:
 
 
 def fix_of(reading: str, info: SequenceInfo) -> str:
-    """What to do if ``reading`` is the right one."""
+    """Say what to do if ``reading`` is the right one."""
     return FIXES[reading].format(width=info.width, height=info.height, scale=info.scale)

@@ -237,7 +237,7 @@ def _read(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def proved(checks: Sequence[SurfaceCheck]) -> int | None:
-    """The reading that the cameras prove on what stands still: 0 the stated one; None: they prove none."""
+    """Return the reading that the cameras prove on what stands still: 0 the stated one; None: they prove none."""
     still, agree = sum(check.still for check in checks), sum(check.agree for check in checks)
     if still < PIXELS:
         return None

@@ -1,4 +1,4 @@
-"""What the files hold: NaN, infinities, values out of range, channels that never change, colour that looks clipped."""
+"""Values in the files: NaN, infinities, out of range, channels that never change, colour that looks clipped."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -162,5 +162,5 @@ def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
 
 
 def judge_values(checks: Sequence[ValuesCheck]) -> list[Finding]:
-    """Findings about values, constant channels and the scale of colour."""
+    """Judge values, constant channels and the scale of colour."""
     return [_judge_defects(checks), _judge_constant(checks), _judge_scale(checks)]

@@ -68,7 +68,7 @@ def _choose(inventory: Inventory) -> dict[str, Group]:
 
 
 def make_draft(inventory: Inventory) -> Draft:
-    """The first recipe.
+    """Make the first recipe.
 
     Raises:
       ValueError: colour, depth or motion is not found; says which files there are.

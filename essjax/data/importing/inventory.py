@@ -1,4 +1,4 @@
-"""What a dump holds that nobody described: files by pattern, their channels by image, and what their names say.
+"""Inventory of a dump that nobody described: files by pattern, channels by image, and what their names say.
 
 Nothing here looks at more than one frame, or compares pictures; ``essjax.data.guess`` does.
 """
@@ -38,7 +38,7 @@ COUNTS = {"motion": 2, "base_color": 3, "normal": 3, "world_position": 3, "refer
 
 
 _ORDER = {letter: place for letters in ("RGBA", "XYZW", "UV") for place, letter in enumerate(letters)}
-"""Of the channels of a layer; indices come in theirs."""
+"""Names of the channels of a layer; indices come in theirs."""
 
 
 class Group(NamedTuple):
@@ -117,7 +117,7 @@ def _patterns(paths: list[PurePosixPath]) -> dict[str, dict[int, PurePosixPath]]
 
 
 def role_of(text: str) -> str:
-    """The image that a name means, or ""."""
+    """Return the image that a name means, or ""."""
     words = re.sub(r"([a-z])([A-Z])", r"\1_\2", text).lower()
     return next((role for role, words_of in ROLES.items() if re.search(words_of, words)), "")
 
