@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from essjax.data import Dataset, write_dataset, write_sequence
-from essjax.scenes import make_scene, presets, render_sequence
+from essjax.scenes import Rendering, make_scene, presets, render_sequence
 from essjax.scenes.builder import FLOOR, Builder, Scene, rotation
 from essjax.scenes.materials import Material
 
@@ -144,6 +144,6 @@ CLIPS: dict[str, Callable[[], Scene]] = {
 
 def render(name: str, folder: Path, *, width: int = WIDTH, height: int = HEIGHT, spp: int = SPP) -> Dataset:
     """Render a clip's dataset as an import would leave it: without the masks that only the renderer knows."""
-    sequence = render_sequence(CLIPS[name](), width, height, scale=2, spp=spp)
+    sequence = render_sequence(CLIPS[name](), width, height, rendering=Rendering(scale=2, spp=spp))
     write_sequence(folder, "clip", dataclasses.replace(sequence, valid=None, steady=None))
     return write_dataset(folder, {"test": ["clip"]})
