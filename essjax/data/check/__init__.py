@@ -75,6 +75,12 @@ class _Checks:
         self.shown = step.number
 
 
+def _is_srgb(info: SequenceInfo) -> bool:
+    """Whether the recipe of the import says so."""
+    rule = info.source.get("color")
+    return isinstance(rule, Mapping) and rule.get("encoding") == "srgb"
+
+
 def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
     jitter = [check.jitter for check in checks]
     own = info.source.get("reference") == "color"
@@ -92,7 +98,7 @@ def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
         judge_between(jitter, motion_wrong=motion_wrong, against=against),
         shift,
         *judge_geometry([check.geometry for check in checks], motion_wrong=motion_wrong),
-        *judge_values([check.values for check in checks]),
+        *judge_values([check.values for check in checks], srgb=_is_srgb(info)),
         *judge_continuity([check.continuity for check in checks]),
     ]
 

@@ -131,7 +131,7 @@ def _judge_constant(checks: Sequence[ValuesCheck]) -> Finding:
     return Finding(check, "ok", f"only {some(values)}" if values else "none", "", constant)
 
 
-def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
+def _judge_scale(checks: Sequence[ValuesCheck], srgb: bool) -> Finding:
     check, extremes = "colour scale", _extremes(checks)
     for image in ("color", "reference"):
         total = max(sum(c.pixels[image] for c in checks), 1)
@@ -149,6 +149,8 @@ def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
             return Finding(check, "warning", found, fix, {"max": top})
         high = max(extremes[channel][1] for channel in channels_of(image, 3))
         share = sum(c.at_top[image] for c in checks) / sum(c.pixels[image] for c in checks)
+        if srgb and high == 1:
+            return Finding(check, "ok", f"{image} ends at 1, as sRGB does ({share:.1%} of it)", "", {"max": high})
         if high in CLIPPED and share > CLIPPED[high]:
             found = f"{image} never exceeds {high:g} and is exactly that in {share:.1%} of its values: it looks clipped"
             fix = (
@@ -161,6 +163,6 @@ def _judge_scale(checks: Sequence[ValuesCheck]) -> Finding:
     return Finding(check, "ok", f"radiance up to {high:.3g}", "", {"max": high})
 
 
-def judge_values(checks: Sequence[ValuesCheck]) -> list[Finding]:
-    """Judge values, constant channels and the scale of colour."""
-    return [_judge_defects(checks), _judge_constant(checks), _judge_scale(checks)]
+def judge_values(checks: Sequence[ValuesCheck], *, srgb: bool = False) -> list[Finding]:
+    """Judge values, constant channels and the scale of colour; ``srgb``: it was decoded at import."""
+    return [_judge_defects(checks), _judge_constant(checks), _judge_scale(checks, srgb)]

@@ -139,6 +139,7 @@ def test_pictures_of_8_bits_that_were_taken_as_linear(good, change, verdict, fix
         check.add(dataclasses.replace(step, raw={**step.raw, "color": change(step.raw["color"])}))
     finding = judge_values([check])[2]
     assert finding.verdict == verdict and fix in finding.fix
+    assert judge_values([check], srgb=True)[2].verdict == ("warning" if verdict == "warning" else "ok")
 
 
 def test_motion_that_is_longer_than_anything_can_be(good):
