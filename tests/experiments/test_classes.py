@@ -18,6 +18,8 @@ from experiments.classes import QUESTIONS, class_remark, class_scores, confusion
 from experiments.evaluate import Clip
 from experiments.members import settings_of
 from experiments.report.classes import COLORS, class_picture, write_class_sheet
+from experiments.variants import VARIANTS
+from experiments.variants.classifier import thresholds
 from tests.helpers import make_sequence
 
 T, H, W = 5, 4, 6
@@ -76,6 +78,20 @@ def test_scored_frames_are_compared():
     assert "ghosting visibility 1.00" in remark and "(accuracy 100 %)" in remark
     bare = dataclasses.replace(clips[0], sequence=dataclasses.replace(sequence, ranges=None))
     assert evaluate_classes(oracle(0), known, [bare], AT) == ({}, [])
+
+
+def test_what_the_variant_finds_for_a_run(tmp_path):
+    """Scores, a remark and a picture, by the thresholds of the run's size; nothing of data without ranges."""
+    clips = [clip("a", 0)]
+    settings = settings_of("classifier", "smoke", [f"data.size=[{W},{H}]"])
+    frames = clips[0].sequence.frames
+    labels = label_sequence(clips[0].sequence.ranges, jnp.asarray(frames.cut), at=thresholds(settings))
+    known, inspect = jnp.asarray(labels.ghosting[..., 0]), VARIANTS["classifier"].inspect
+    found = inspect(oracle(0), known, clips, settings, tmp_path / "report")
+    assert found.scores["all"]["ghosting"]["accuracy"] == 1.0 and found.remark.startswith("classifier: intersection")
+    assert len(list((tmp_path / "report").glob("labels-a-frame-*.png"))) == 1
+    bare = dataclasses.replace(clips[0], sequence=dataclasses.replace(clips[0].sequence, ranges=None))
+    assert inspect(oracle(0), known, [bare], settings, tmp_path) is None
 
 
 def test_pictures(tmp_path):
