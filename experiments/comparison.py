@@ -1,5 +1,6 @@
 """The rows of a run's table: which methods, with which variables, and what to tell the reader about them."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,6 @@ from essjax.typing import PyTree
 from experiments import checks
 from experiments.evaluate import Clip, Clips, Runner
 from experiments.members import Member
-from experiments.settings import with_value
 from experiments.tuning import Setting, setting_variables, tune
 from experiments.variants import VARIANTS
 
@@ -77,7 +77,8 @@ def make_runners(
 
 
 def _clamped(member: Member, clamp: str) -> Method:
-    return VARIANTS[member.name].method(with_value(member.settings, "method.clamp", clamp))
+    arguments = dataclasses.replace(member.settings.method, clamp=clamp)
+    return VARIANTS[member.name].method(dataclasses.replace(member.settings, method=arguments))
 
 
 def unfit(method: Method, sequence: FrameSequence) -> str:

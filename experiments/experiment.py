@@ -31,7 +31,7 @@ from experiments.members import Member, all_settings, resolve
 from experiments.progress import Phases, TrainingProgress
 from experiments.report import print_table, write_report
 from experiments.request import Request, check_folder, run_record
-from experiments.settings import Settings, with_value
+from experiments.settings import Settings, with_data
 from experiments.tensorboard import Events, check_installed
 from experiments.training import initial_variables, read_losses, restore_member, train_member
 from experiments.tuning import Setting
@@ -135,15 +135,14 @@ def _prepare(request: Request, settings: Mapping[str, Settings], phases: Phases,
     opened = read_dataset(request.data) if request.data is not None else None
     if opened:  # labels depend on the size of the image: a user's data has its own
         size = opened.info.width, opened.info.height
-        settings = {name: with_value(own, "data.size", size) for name, own in settings.items()}
+        settings = {name: with_data(own, size=size) for name, own in settings.items()}
     members = resolve(settings, request.preset, request.out)
     wanted, steps = [members[name] for name in request.names], None
     if opened is None:
         check_settings(wanted)
     trainings = trainings_of(wanted)
-    if (
-        trainings and not opened and not (request.out / "run.json").exists()
-    ):  # else stages may have been trained already
+    fresh = not (request.out / "run.json").exists()  # else stages may have been trained already
+    if trainings and fresh and opened is None:
         first = next(iter(trainings.values()))
         steps = stack.enter_context(contextlib.closing(Ahead(first))).steps
     dataset = datasets.prepare(

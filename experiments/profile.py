@@ -12,7 +12,7 @@ from essjax.frames import select_time
 from essjax.rollout import ESS, SS, stream
 from experiments.datasets import rendering_of
 from experiments.members import resolve, settings_of
-from experiments.settings import with_value
+from experiments.settings import with_data
 from experiments.trace import describe, operations
 from experiments.training import initial_state, initial_variables, make_batches, make_step
 
@@ -21,7 +21,7 @@ def write_profile(
     name: str, preset: str, overrides: Sequence[str], out: Path, console: Console, *, repetitions: int = 5
 ) -> int:
     """Trace ``repetitions`` train steps of the last stage and as many SS/ESS pairs; compilation is not in the trace."""
-    settings = with_value(settings_of(name, preset, overrides), "data.fresh", None)
+    settings = with_data(settings_of(name, preset, overrides), fresh=None)
     member, folder = resolve({name: settings}, preset, out)[name], out / "profile"
     stages, method = member.stages, member.method
     clips = plan("train", 1, max([3, *(stage.settings.clip for stage in stages)]), spp=1, families=["carousel"])

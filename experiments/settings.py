@@ -10,7 +10,7 @@ import inspect
 import json
 import math
 import types
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal, Union, get_args, get_origin
 
 PRESETS = ("smoke", "quick", "paper")
@@ -172,22 +172,59 @@ def make_settings(
     """
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}.")
-    stages = {
-        name: _blank(StageSettings, loss=arguments(objective)()) for name, objective in (objectives or {}).items()
-    }
-    groups = {name: _blank(kind) for name, kind in (("data", Data), ("training", Training), ("evaluation", Evaluation))}
-    settings = _blank(Settings, **groups, method=arguments(method)(), stages=stages)
-    for path, values in {**COMMON, **(table or {})}.items():
-        settings = with_value(settings, path, values[PRESETS.index(preset)])
-    for path, value in (overrides or {}).items():
-        settings = with_value(settings, path, value)
-    check(settings)
-    return settings
+    groups: dict[str, type] = {"": Settings, "data.": Data, "training.": Training, "evaluation.": Evaluation}
+    groups["method."] = arguments(method)
+    stages = {f"stages.{name}.": objective for name, objective in (objectives or {}).items()}
+    for stage, objective in stages.items():
+        groups |= {stage: StageSettings, f"{stage}loss.": arguments(objective)}
+    fields = {above + field.name: field for above, kind in groups.items() for field in dataclasses.fields(kind)}
+    fields = {path: field for path, field in fields.items() if _plain(field.type)}  # the others are the groups
+    values = {path: None if field.default is dataclasses.MISSING else field.default for path, field in fields.items()}
+    chosen = {path: row[PRESETS.index(preset)] for path, row in {**COMMON, **(table or {})}.items()}
+    for path, value in (*chosen.items(), *(overrides or {}).items()):
+        values |= dict.fromkeys(_paths(path, fields, list(stages)), value)
+    _check(values, {path: field.type for path, field in fields.items()})
+
+    def group(above: str, **inner: Any) -> Any:
+        names = [field.name for field in dataclasses.fields(groups[above])]
+        return groups[above](**{name: values[above + name] for name in names if above + name in values}, **inner)
+
+    inner = {name: group(f"{name}.") for name in ("data", "training", "evaluation", "method")}
+    inner["stages"] = {stage.split(".")[1]: group(stage, loss=group(f"{stage}loss.")) for stage in stages}
+    return group("", **inner)
 
 
-def _blank(kind: type, **values: Any) -> Any:
-    """Make a dataclass whose other fields are None for now: tables fill them, ``check`` sees which they forget."""
-    return kind(**dict.fromkeys(field.name for field in dataclasses.fields(kind)) | values)
+def _paths(path: str, known: Collection[str], stages: Collection[str]) -> list[str]:
+    """Find what ``path`` means: one setting, or the same one of every stage.
+
+    Raises:
+      ValueError: there is no such setting; the names at that level are listed.
+    """
+    first, _, rest = path.partition(".")
+    full = f"stages.{path}" if f"stages.{first}." in stages else path
+    if full in known:
+        return [full]
+    every = [stage + rest for stage in stages]
+    if first == "stages" and rest.split(".")[0] in StageSettings.__dataclass_fields__ and set(every) <= set(known):
+        return every
+    level = full
+    while level and not _below(f"{level}.", known):
+        level = level.rpartition(".")[0]
+    names = _below(f"{level}." if level else "", known)
+    if level == full:
+        raise ValueError(f"{full} is a group of settings: {', '.join(names)}.")
+    names += [stage.split(".")[1] for stage in stages if not level]
+    last = full.split(".")[-1]
+    meant = [one for one in known if one.split(".")[-1] in (last, last.removeprefix("first_"))]
+    raise ValueError(
+        f"unknown setting {full!r}; {level or 'the top level'} has {', '.join(names)}."
+        + (f" Did you mean {' or '.join(meant)}?" if meant else "")
+    )
+
+
+def _below(level: str, known: Collection[str]) -> list[str]:
+    """List the names at a level."""
+    return list(dict.fromkeys(path.removeprefix(level).split(".")[0] for path in known if path.startswith(level)))
 
 
 @functools.cache
@@ -208,69 +245,21 @@ def arguments(function: Callable) -> type:
 def _plain(kind: Any) -> bool:
     if get_origin(kind) in (Union, types.UnionType, tuple):
         return all(part is Ellipsis or _plain(part) for part in get_args(kind))
-    return kind in (int, float, bool, str, type(None))
+    return get_origin(kind) is Literal or kind in (int, float, bool, str, type(None))
 
 
-def with_value(settings: Settings, path: str, value: Any) -> Settings:
-    """Return the settings with another value at ``path``; see the top of the module for what a path is.
-
-    Raises:
-      ValueError: there is no such setting; the names at that level are listed.
-    """
-    names = path.split(".")
-    if names[0] in settings.stages:
-        names = ["stages", *names]
-    fields = {field.name for field in dataclasses.fields(StageSettings)}
-    if len(names) > 1 and names[0] == "stages" and names[1] in fields:
-        for stage in settings.stages:
-            settings = _replaced(settings, ["stages", stage, *names[1:]], value, settings)
-        return settings
-    return _replaced(settings, names, value, settings)
+def with_data(settings: Settings, **changes: Any) -> Settings:
+    """Return the settings with other values in ``data``."""
+    return dataclasses.replace(settings, data=dataclasses.replace(settings.data, **changes))
 
 
-def _replaced(node: Any, names: Sequence[str], value: Any, settings: Settings, above: str = "") -> Any:
-    (name, *rest), children = names, _children(node)
-    if name not in children or bool(rest) != _is_group(children[name]):
-        raise ValueError(_unknown(above + ".".join(names), above + name, children, name, settings))
-    child = _replaced(children[name], rest, value, settings, f"{above}{name}.") if rest else value
-    return {**node, name: child} if isinstance(node, Mapping) else dataclasses.replace(node, **{name: child})
-
-
-def _unknown(path: str, at: str, children: Mapping[str, Any], name: str, settings: Settings) -> str:
-    if name in children and _is_group(children[name]):
-        return f"{path} is a group of settings: {', '.join(_children(children[name])) or 'none here'}."
-    level = at.rpartition(".")[0]
-    valid = [*children, *(() if level else settings.stages)]
-    if name in children:
-        return f"{at} is one setting: there is no {path}."
-    message = f"unknown setting {path!r}; {level or 'the top level'} has {', '.join(valid) or 'none'}."
-    old = name.removeprefix("first_")
-    meant = [each for each in flatten(settings) if each.split(".")[-1] in (name, old)]
-    return message + (f" Did you mean {' or '.join(meant)}?" if meant else "")
-
-
-def _children(node: Any) -> dict[str, Any]:
-    return dict(node) if isinstance(node, Mapping) else vars(node)
-
-
-def _is_group(node: Any) -> bool:
-    return isinstance(node, Mapping) or dataclasses.is_dataclass(node)
-
-
-def flatten(settings: Settings) -> dict[str, Any]:
-    """Path -> value of every setting."""
-    return {path: value for path, value, _ in _leaves(settings)}
-
-
-def _leaves(node: Any, above: str = "", kinds: Mapping[str, Any] | None = None) -> Iterator[tuple[str, Any, Any]]:
-    """Path, value and type of each setting."""
-    if dataclasses.is_dataclass(node):
-        kinds = {field.name: field.type for field in dataclasses.fields(node)}
-    for name, child in _children(node).items():
-        if _is_group(child):
-            yield from _leaves(child, f"{above}{name}.")
-        else:
-            yield above + name, child, (kinds or {})[name]
+def flatten(tree: Any, above: str = "") -> dict[str, Any]:
+    """Map the path of every setting to its value."""
+    found = {}
+    for name, value in (tree if isinstance(tree, Mapping) else vars(tree)).items():
+        group = isinstance(value, Mapping) or dataclasses.is_dataclass(value)
+        found |= flatten(value, f"{above}{name}.") if group else {above + name: value}
+    return found
 
 
 def parse_override(text: str) -> tuple[str, str, Any]:
@@ -294,23 +283,19 @@ def _as_tuple(value: Any) -> Any:
     return tuple(_as_tuple(part) for part in value) if isinstance(value, list) else value
 
 
-def check(settings: Settings) -> None:
-    """Refuse values of the wrong type or out of bounds.
-
-    Raises:
-      ValueError: names the first one.
-    """
-    for path, value, kind in _leaves(settings):
+def _check(values: Mapping[str, Any], kinds: Mapping[str, Any]) -> None:
+    """Refuse values of the wrong type or out of bounds, each under its path."""
+    for path, value in values.items():
+        kind = kinds[path]
         if not _fits(value, kind):
             expected = str(getattr(kind, "__name__", kind) if get_origin(kind) is None else kind)
             expected = expected.replace("tuple[int, int]", "[width,height]").replace("typing.", "")
             raise ValueError(f"--set {path}: expected {expected}, got {value!r}.")
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, int | float) and not isinstance(number, bool):
-                _check_number(path, number, is_int=kind in (int, int | None, tuple[int, int], tuple[int, int] | int))
-    for name, stage in settings.stages.items():
-        if stage.steps is None and stage.seconds is None:
-            raise ValueError(f"--set: stages.{name}.steps and seconds are both null; give one of them.")
+                _check_number(path, number, is_int=not _fits(0.5, kind) and not _fits((0.5,), kind))
+        if path.endswith(".steps") and value is None and values[f"{path.removesuffix('steps')}seconds"] is None:
+            raise ValueError(f"--set: {path} and seconds are both null; give one of them.")
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -31,7 +31,7 @@ from essjax.train import (
 from essjax.typing import PyTree
 from experiments.datasets import rendering_of, train_clips
 from experiments.members import Member
-from experiments.settings import Settings, StageSettings, with_value
+from experiments.settings import Settings, StageSettings, with_data
 from experiments.validation import Scorer
 from experiments.variants import Stage
 
@@ -133,7 +133,7 @@ def initial_variables(member: Member, dataset: Dataset) -> PyTree:
 def first_batch(dataset: Dataset, settings: Settings, stage: Stage) -> Sequence:
     """Return the first one that ``make_batches`` gives."""
     # Without fresh scenes: the next round would be rendered for nothing.
-    return next(make_batches(dataset, with_value(settings, "data.fresh", None), stage, prefetch=1))
+    return next(make_batches(dataset, with_data(settings, fresh=None), stage, prefetch=1))
 
 
 def initial_state(member: Member, stage: Stage, variables: PyTree, batch: Sequence) -> TrainState:

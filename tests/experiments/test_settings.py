@@ -1,12 +1,14 @@
 import dataclasses
 import functools
+import json
 from pathlib import Path
 
 import pytest
 
 from essjax import methods
+from experiments import comparison
 from experiments.members import all_settings, resolve, settings_of
-from experiments.settings import PRESETS, SHARED, arguments, flatten, make_settings, with_value
+from experiments.settings import PRESETS, SHARED, arguments, flatten, make_settings
 from experiments.variants import VARIANTS, compared, get_variant
 
 
@@ -32,13 +34,13 @@ def test_a_stage_may_be_named_alone_or_left_out():
         ("widht=3", "unknown setting 'widht'; the top level has seed, .*, method, stages, frnet, extrassnet.$"),
         ("method.widht=3", "'method.widht'; method has width, frnet_width, sigma_guide, sigma_distance.$"),
         ("frnet.loss.weight=3", "unknown setting 'stages.frnet.loss.weight'; stages.frnet.loss has feature_weight.$"),
-        ("stages.fasset.batch=3", "unknown setting 'stages.fasset.batch'; stages has frnet, extrassnet.$"),
+        ("stages.fasset.batch=3", "stages has frnet, extrassnet. Did you mean stages.frnet.batch or"),
         ("method.scale=4", "method has width, .*. Did you mean data.scale?"),
         ("size=[96,54]", "unknown setting 'size'; .* Did you mean data.size?"),  # as it was called before
         ("first_steps=3", "Did you mean stages.frnet.steps or stages.extrassnet.steps?"),
         ("vgg=w.npz", "Did you mean training.vgg?"),
         ("data=3", "data is a group of settings: size, scale, "),
-        ("seed.first=3", "seed is one setting: there is no seed.first."),
+        ("seed.first=3", "unknown setting 'seed.first'; the top level has seed, "),
         ("width", "--set width: expected path=value."),
         ("method.width=wide", "--set method.width: expected int, got 'wide'"),
         ("data.size=[96]", r"--set data.size: expected \[width,height\], got \(96,\)"),
@@ -174,11 +176,17 @@ def test_a_crop_that_a_paper_gives_in_output_pixels_follows_the_scale():
     assert crop("extrass-e", "paper", "data.scale=4") == (128, 128)  # not said there
 
 
-def test_a_value_is_replaced_where_it_stands():
-    settings = settings_of("taau", "quick")
-    other = with_value(settings, "method.clamp", "none")
-    assert other.method.clamp == "none" and settings.method.clamp == "ycocg"
-    assert with_value(other, "method.clamp", "ycocg") == settings
+def test_a_tuned_clamp_is_an_argument_like_any_other():
+    member = members(["taau"], overrides=["data.scale=4"])["taau"]
+    made = dict(comparison._clamped(member, "none").recipe.arguments)
+    assert (made["clamp"], made["scale"]) == ("none", 4) and member.settings.method.clamp == "ycocg"
+
+
+def test_flat_settings_are_overrides():
+    """What ``run.json`` holds gives the same settings again."""
+    settings = settings_of("extrass", "paper", ["frnet.batch=3"])
+    written = [f"{path}={json.dumps(value)}" for path, value in flatten(settings).items()]
+    assert settings_of("extrass", "smoke", written) == settings and len(written) > 40
 
 
 def test_optimizers_are_those_that_there_are():
