@@ -214,11 +214,6 @@ def _join(parts: list[Collected]) -> Collected:
     }
 
 
-def frames_of(kinds: tuple[str, ...], kind: str) -> list[int]:
-    """List the indices of the frames of one kind."""
-    return [n for n, k in enumerate(kinds) if k == kind]
-
-
 def bake(method: Method, variables: PyTree) -> Method:
     """Build trained ``variables`` into ``method``, for streaming and shipping; its own variables are ``{}``.
 

@@ -17,6 +17,11 @@ def streamed(method, variables, frames: Frame, kinds, **options) -> jax.Array:
     return jnp.stack(list(stream(method, variables, each, kinds, **options)))
 
 
+def indices_of(kinds: tuple[str, ...], kind: str) -> list[int]:
+    """Of the frames of one kind."""
+    return [n for n, each in enumerate(kinds) if each == kind]
+
+
 def random_image(seed: int, *shape: int, low: float = 0.0, high: float = 2.0) -> jax.Array:
     """Uniform noise in [low, high), float32."""
     return jnp.asarray(np.random.default_rng(seed).uniform(low, high, shape), jnp.float32)

@@ -12,8 +12,8 @@ import pytest
 
 from essjax.frames import Prediction, select_time, without_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation, reset_at_cut
-from essjax.rollout import ESS, SS, alternate, bake, check_supported, every, frames_of, stream, stream_step, unroll
-from tests.helpers import at, make_frames, streamed
+from essjax.rollout import ESS, SS, alternate, bake, check_supported, every, stream, stream_step, unroll
+from tests.helpers import at, indices_of, make_frames, streamed
 
 
 def toy(latency: int = 0, **info) -> Method:
@@ -68,8 +68,8 @@ def test_kinds():
     assert every().kinds(3) == (SS, SS, SS)
     assert alternate(0).kinds(5) == (SS, ESS, SS, ESS, SS)
     assert alternate(1).kinds(6) == (SS, SS, ESS, SS, ESS, SS)
-    assert frames_of(alternate(1).kinds(6), ESS) == [2, 4]
-    both = [set(frames_of(alternate(parity).kinds(9), ESS)) for parity in (0, 1)]
+    assert indices_of(alternate(1).kinds(6), ESS) == [2, 4]
+    both = [set(indices_of(alternate(parity).kinds(9), ESS)) for parity in (0, 1)]
     assert both[0] | both[1] == set(range(1, 9)) and not both[0] & both[1]  # every frame but 0 is extrapolated once
     with pytest.raises(ValueError, match="parity: expected 0 or 1, got 2"):
         alternate(2)
@@ -85,7 +85,7 @@ def test_unroll_equals_a_python_loop(schedule, length):
     np.testing.assert_allclose(result.image, images, rtol=1e-6, atol=1e-6)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), result.history, history)
     for kind in (SS, ESS):
-        chosen = frames_of(schedule.kinds(length), kind)
+        chosen = indices_of(schedule.kinds(length), kind)
         assert (kind in result.aux) == bool(chosen)
         if chosen:
             np.testing.assert_array_equal(result.aux[kind]["count"], jnp.stack([counts[n] for n in chosen]))

@@ -59,7 +59,6 @@ CALLS = {
     warp.jitter_aligned_upsample: (IMAGE, {"scale": 1.5}, JITTER),
     warp.jittered_motion: (FIELD, JITTER, JITTER), warp.occlusion_motion: (FIELD, PLANE, PLANE),
     warp.sample: (IMAGE, LARGE_FIELD), warp.sample_by_fetches: (IMAGE, LARGE_FIELD),
-    warp.sample_distance: ({"height": H, "width": W, "scale": 2}, JITTER),
     warp.sample_zero_upsampled: (IMAGE, LARGE_FIELD, {"scale": 2}, JITTER),
     warp.space_to_depth: (array(4, **LARGE), {"block": 2}), warp.splat: (IMAGE, FIELD),
     warp.splat_motion: (IMAGE, PLANE, FIELD), warp.splat_nearest: (IMAGE, PLANE, FIELD),

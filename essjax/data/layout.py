@@ -311,7 +311,7 @@ def write_dataset(
 
 
 def read_index(root: str | os.PathLike) -> tuple[list[str], dict[str, Any], dict[str, Any]]:
-    """Names of the sequences, source and splits as ``dataset.json`` has them, be the sequences finished or not.
+    """Read names of sequences, source and splits from ``dataset.json``, also of sequences that are not finished.
 
     Raises:
       ValueError: the file is missing, damaged, of another schema, or lacks a field.

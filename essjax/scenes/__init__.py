@@ -13,14 +13,12 @@ from essjax.scenes.families import (
     TRAIN_FAMILIES,
     families_of,
     make_scene,
-    split_scenes,
     split_seeds,
 )
 from essjax.scenes.jitter import jitter_sequence
-from essjax.scenes.sequence import Rendering, iterate_frames, render_frame, render_sequence, subsample_statistics
+from essjax.scenes.sequence import Rendering, iterate_frames, render_frame, render_sequence
 
 __all__ = [
-    "EXTRA_FAMILIES", "FAMILIES", "SPLITS", "TEST_ONLY_FAMILIES", "TRAIN_FAMILIES", "Rendering", "Scene", "families_of",
-    "iterate_frames", "jitter_sequence", "make_scene", "render_frame", "render_sequence", "split_scenes",
-    "split_seeds", "subsample_statistics",
+    "EXTRA_FAMILIES", "FAMILIES", "Rendering", "SPLITS", "Scene", "TEST_ONLY_FAMILIES", "TRAIN_FAMILIES",
+    "families_of", "iterate_frames", "jitter_sequence", "make_scene", "render_frame", "render_sequence", "split_seeds",
 ]  # fmt: skip

@@ -64,11 +64,6 @@ def stack(a: Vec) -> Array:
     return jnp.stack([a.x, a.y, a.z], axis=-1)
 
 
-def unstack(a: Array) -> Vec:
-    """Inverse of ``stack``."""
-    return Vec(x=a[..., 0], y=a[..., 1], z=a[..., 2])
-
-
 def smaller(a: Array, b: Array | float) -> Array:
     """Minimum without NaN rules: ``jnp.minimum`` keeps XLA:CPU from vectorising the intersection loops (2.5x)."""
     return jnp.where(a < b, a, b)

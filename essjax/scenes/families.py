@@ -70,8 +70,3 @@ def split_seeds(split: str, count: int, *, start: int = 0) -> list[int]:
     """
     families_of(split)
     return [3 * k + SPLITS.index(split) for k in range(start, start + count)]
-
-
-def split_scenes(split: str, sequences: int, *, start: int = 0) -> list[tuple[str, int]]:
-    """``(family, seed)`` of a split: ``sequences`` of each of its families, interleaved."""
-    return [(family, seed) for seed in split_seeds(split, sequences, start=start) for family in families_of(split)]

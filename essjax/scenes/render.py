@@ -266,7 +266,7 @@ def _erode(mask: np.ndarray) -> np.ndarray:
 def render_statistics(
     world: World, previous: World, width: int, height: int, *, spp: int = 64
 ) -> dict[str, np.ndarray]:
-    """Images ``[H, W, C]`` of what ``sequence.subsample_statistics`` returns, and the same samples' ``reference``."""
+    """Render the images of ``frames.SampleRanges``, ``[H, W, C]``, and the same samples' ``reference``."""
     world, previous = jax.device_put((world, previous))
     offsets = ((reference_samples(spp) - 0.5) / width).astype(np.float32)
     angle, rays = pixel_angle(world, width), max(chunk_size(), spp)

@@ -24,8 +24,8 @@ class Rendering(NamedTuple):
       scale: reference size over frame size.
       spp: samples per reference pixel.
       native: also render 1-sample frames at the reference's size; their jitter advances every frame.
-      ranges: also the ranges over the reference's samples (what a classifier's labels are made of), see
-        ``subsample_statistics``.
+      ranges: also the ranges over the reference's samples (what a classifier's labels are made of: Guo et al. 2022,
+        section 2); the background's normal counts as 0.
       mip_bias: texture filter of LR and native frames, log2 of its width over an output pixel's: 0 is what
         upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
         Eq 47 of thesis 002, -log2(f) - log2(spp) / 2 over an *input* pixel, is ``-log2(spp) / 2`` here: 0 for its
@@ -154,20 +154,3 @@ def render_sequence(
         parts.append(part)
         on_frame(index)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-
-
-def subsample_statistics(scene: Scene, index: int, width: int, height: int, *, spp: int = 64) -> SampleRanges:
-    """Ranges over the samples of each output pixel: what classifier labels are made of (Guo et al. 2022, section 2).
-
-    Args:
-      scene: from ``make_scene``.
-      index: frame number.
-      width: output width (that of the reference), pixels.
-      height: output height, pixels.
-      spp: samples per pixel, those of the reference.
-
-    Returns:
-      NumPy leaves ``[H, W, C]``; the background's normal counts as 0.
-    """
-    _check_size(width, height, 1, spp)
-    return _ranges(render_statistics(scene.at(index), scene.before(index), width, height, spp=spp), scene.unit)

@@ -17,7 +17,6 @@ from essjax.warp.sampling import inside_mask, sample
 from essjax.warp.upsample import (
     depth_to_space,
     jitter_aligned_upsample,
-    sample_distance,
     sample_zero_upsampled,
     space_to_depth,
     zero_upsample,
@@ -26,7 +25,7 @@ from essjax.warp.upsample import (
 __all__ = [
     "Resampled", "backward_warp", "candidate_offsets", "compose_motion", "depth_to_space", "dilate_motion",
     "fill_holes", "gaussian_resample", "gbuffer_guided_warp", "guided_weights", "guides", "hole_mask", "inside_mask",
-    "jitter_aligned_upsample", "jittered_motion", "occlusion_motion", "sample", "sample_by_fetches", "sample_distance",
+    "jitter_aligned_upsample", "jittered_motion", "occlusion_motion", "sample", "sample_by_fetches",
     "sample_zero_upsampled", "space_to_depth", "splat", "splat_motion", "splat_nearest", "tent_resample",
     "upsample_motion", "zero_upsample",
 ]  # fmt: skip

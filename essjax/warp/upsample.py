@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from essjax.cameras import pixel_positions
-from essjax.typing import Array, Float, Image, Jitter, Places, Positions, Resized
+from essjax.typing import Array, Float, Image, Jitter, Places, Resized
 from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.sampling import Tap, axis_taps, check_mode, gather_pixels, sample
 
@@ -146,27 +145,6 @@ def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode:
         return result.astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.floating) else result
 
     return over_leading_axes(one, (3, 1), image, jitter)
-
-
-def sample_distance(height: int, width: int, scale: int, jitter: Jitter) -> Positions:
-    """Vector from each HR pixel centre to the LR sample of the LR pixel that contains it.
-
-    Args:
-      height: of the LR image.
-      width: of the LR image.
-      scale: whole number.
-      jitter: ``[..., 2]`` (x, y) LR pixels.
-
-    Returns:
-      ``[..., scale * height, scale * width, 2]`` (x, y) in HR pixels; within +-scale.
-
-    Raises:
-      ValueError: the scale is no whole number >= 1, or the jitter is not ``[..., 2]``.
-    """
-    scale = check_scale(scale)
-    centers = pixel_positions(height * scale, width * scale)
-    samples = jnp.floor(centers / scale) + 0.5 + check_jitter(jitter)[..., None, None, :]
-    return samples * scale - centers
 
 
 def space_to_depth(x: Image, block: int) -> Float[Array, "... H W C"]:

@@ -15,9 +15,9 @@ from essjax.frames import select_time, without_color
 from essjax.methods import extranet, extranet_from_torch
 from essjax.methods._extranet import relative_depth
 from essjax.methods.rendered import albedo
-from essjax.rollout import ESS, SS, alternate, check_supported, frames_of, unroll
+from essjax.rollout import ESS, SS, alternate, check_supported, unroll
 from essjax.warp import backward_warp, compose_motion, hole_mask, jittered_motion, occlusion_motion
-from tests.helpers import make_frames, random_image
+from tests.helpers import indices_of, make_frames, random_image
 from tests.networks.test_extranet import state_dict
 from tests.test_tensors import checkpoint
 
@@ -98,7 +98,7 @@ def test_what_the_network_sees():
     np.testing.assert_array_equal(seen.features[..., 4:5], last.gbuffers.roughness)
     np.testing.assert_array_equal(seen.features[..., 5:6], last.gbuffers.metallic)
     np.testing.assert_allclose(images[5], modulate(expm1(aux["log_shading"]), albedo(last.gbuffers)), rtol=1e-5)
-    for n in frames_of(KINDS, SS):
+    for n in indices_of(KINDS, SS):
         np.testing.assert_array_equal(images[n], frames.color[n])
 
 
@@ -177,7 +177,7 @@ def rollout():
 
 def test_streaming_equals_the_rollout_and_hidden_colour_is_not_read():
     frames = random_frames(2)
-    poisoned = frames.color.at[jnp.array(frames_of(KINDS, ESS))].set(jnp.nan)
+    poisoned = frames.color.at[jnp.array(indices_of(KINDS, ESS))].set(jnp.nan)
     rolled = rollout()(variables(), dataclasses.replace(frames, color=poisoned))
     np.testing.assert_allclose(log1p(rolled), log1p(stream(frames)[0]), rtol=1e-3, atol=1e-3)
 

@@ -15,9 +15,9 @@ from essjax.methods._extrass import history_motion, trusted, warp_shown
 from essjax.methods.extrass_low import blend_mask, refine
 from essjax.methods.rendered import albedo, hole_buffers
 from essjax.networks import frnet
-from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
+from essjax.rollout import ESS, SS, alternate, stream_step, unroll
 from essjax.warp import gbuffer_guided_warp, guides
-from tests.helpers import make_frames, random_image, streamed
+from tests.helpers import indices_of, make_frames, random_image, streamed
 from tests.methods.scene import wall
 
 T, B, H, W = 5, 2, 15, 22
@@ -179,7 +179,7 @@ def test_streaming_equals_the_rollout(busy, parity):
 @both_parities
 def test_colour_of_extrapolated_frames_is_never_read(busy, parity):
     frames = frames_for(parity, 1)
-    hidden = frames_of(alternate(parity).kinds(4 + parity), ESS)
+    hidden = indices_of(alternate(parity).kinds(4 + parity), ESS)
     poisoned = dataclasses.replace(frames, color=frames.color.at[jnp.array(hidden)].set(jnp.nan))
     np.testing.assert_array_equal(rollout(parity)(busy, poisoned), rollout(parity)(busy, frames))
 

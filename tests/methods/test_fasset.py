@@ -15,10 +15,10 @@ from essjax.methods import fasset, gaussian_blur
 from essjax.methods._fasset import sample_nearness
 from essjax.methods.rendered import albedo
 from essjax.networks._fasset import OUTPUT_GAIN
-from essjax.rollout import ESS, SS, alternate, frames_of, stream_step, unroll
+from essjax.rollout import ESS, SS, alternate, stream_step, unroll
 from essjax.scenes.render import render_reference
 from essjax.warp import hole_mask, jitter_aligned_upsample
-from tests.helpers import make_frames, random_image, streamed
+from tests.helpers import indices_of, make_frames, random_image, streamed
 
 T, B, H, W = 4, 2, 30, 40
 TINY = {"width": 4, "hidden": 5}
@@ -154,7 +154,7 @@ def test_streaming_equals_the_rollout(busy):
 
 def test_colour_of_extrapolated_frames_is_never_read(busy):
     frames = random_frames(1)
-    hidden = frames_of(alternate(0).kinds(T), ESS)
+    hidden = indices_of(alternate(0).kinds(T), ESS)
     poisoned = dataclasses.replace(frames, color=frames.color.at[jnp.array(hidden)].set(jnp.nan))
     np.testing.assert_array_equal(rollout()(busy, poisoned), rollout()(busy, frames))
 

@@ -14,7 +14,6 @@ from essjax.warp import (
     jitter_aligned_upsample,
     jittered_motion,
     sample,
-    sample_distance,
     sample_zero_upsampled,
     space_to_depth,
     zero_upsample,
@@ -111,26 +110,6 @@ def test_jau_keeps_constants_and_type():
     np.testing.assert_array_equal(high, jnp.full(high.shape, 0.3, jnp.bfloat16))
 
 
-@pytest.mark.parametrize("scale", [2, 3])
-@FEW
-@given(x=in_pixel, y=in_pixel)
-def test_sample_distance_leads_to_the_sample(scale, x, y):
-    jitter = np.float32([x, y])
-    got = np.asarray(jax.jit(sample_distance, static_argnums=(0, 1, 2))(H, W, scale, jitter))
-    assert got.shape == (scale * H, scale * W, 2)
-    samples = (np.asarray(pixel_positions(H, W)) + jitter) * scale
-    expected = np.repeat(np.repeat(samples, scale, 0), scale, 1) - np.asarray(pixel_positions(scale * H, scale * W))
-    np.testing.assert_allclose(got, expected, atol=1e-4)
-
-
-def test_sample_distance_by_hand():
-    got = np.asarray(sample_distance(H, W, 2, jnp.array([[0.25, -0.5], [0.0, 0.0]])))
-    assert got.shape == (2, 2 * H, 2 * W, 2)
-    assert got[0, 0, 0].tolist() == [1.0, -0.5]  # sample at (1.5, 0), HR centre at (0.5, 0.5)
-    assert got[0, 3, 5].tolist() == [0.0, -1.5]
-    assert got[1, 0, 0].tolist() == [0.5, 0.5]
-
-
 def test_space_to_depth_channel_order_by_hand():
     x = np.arange(2 * 4 * 2).reshape(2, 4, 2)  # values: 8 y + 2 x + c
     got = np.asarray(space_to_depth(x, 2))
@@ -169,7 +148,6 @@ TAKE_JITTER = {
     "zero_upsample": lambda jitter: zero_upsample(image_of(0), 2, jitter),
     "sample_zero_upsampled": lambda jitter: sample_zero_upsampled(image_of(0), jnp.ones((2, 2, 2)), 2, jitter),
     "jitter_aligned_upsample": lambda jitter: jitter_aligned_upsample(image_of(0), 2, jitter),
-    "sample_distance": lambda jitter: sample_distance(H, W, 2, jitter),
     "gaussian_resample": lambda jitter: gaussian_resample(image_of(0), image_of(0), jitter, jnp.float32(0.5), 2).color,
     "jittered_motion": lambda jitter: jittered_motion(jnp.zeros((H, W, 2)), jitter, jitter),
 }
