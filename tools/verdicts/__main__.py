@@ -2,17 +2,24 @@
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from essjax.data import Dataset, read_dataset, read_sequence, write_dataset, write_sequence
 from essjax.data.check import check_dataset
 from essjax.data.check.finding import Finding
-from tools.verdicts.clips import CLIPS, render
+from tools.verdicts.clips import CLIPS, UNSEEN, render
 from tools.verdicts.corruptions import CORRUPTIONS, Corruption
 
 RIGHT, SILENT, MISSED, MISLED = "named", "not decidable", "missed", "misled"
 """Outcomes: the right fix alone; nothing to see, and nothing said; nothing said; another fix, too."""
 PAGE = Path(__file__).parent / "RESULTS.md"
+HEAD = """# What `essjax check` says of clips, right and broken
+
+Made by `python -m tools.verdicts`; the clips are in `clips.py`, the corruptions in `corruptions.py`.
+*named*: the right fix was told, and no other; *not decidable*: the corruption changes nothing that pictures
+could show, and nothing is called wrong; *missed*: nothing is called wrong; *misled*: something else is.
+"""
 
 
 def wrongs(dataset: Dataset) -> list[Finding]:
@@ -34,39 +41,41 @@ def outcome(dataset: Dataset, corruption: Corruption, folder: Path) -> tuple[str
     return (RIGHT if len(right) == len(found) else MISLED), found
 
 
+def examine(clips: Sequence[str], corruptions: Sequence[str], root: Path, temporary: Path) -> str:
+    """Render clips that are not there, check them as they are and broken, and write it down as Markdown."""
+    table, alarms, details = {}, {}, []
+    for clip in clips:
+        folder = root / clip.replace(" ", "-")
+        dataset = read_dataset(folder) if (folder / "dataset.json").exists() else render(clip, folder)
+        alarms[clip] = wrongs(dataset)
+        details += [f"- {clip}, as it is: {f.check}: {f.found}. {f.fix}" for f in alarms[clip]]
+        for name in corruptions:
+            broken = temporary / f"{clip}-{name}".replace("/", "-")
+            verdict, found = outcome(dataset, CORRUPTIONS[name], broken)
+            table[clip, name] = verdict
+            print(f"{clip}, {name}: {verdict}", flush=True)
+            if verdict in (MISSED, MISLED):
+                details += [f"- {clip}, {name}: {verdict}: {f.check}: {f.found}. {f.fix}" for f in found]
+                details += [] if found else [f"- {clip}, {name}: {verdict}"]
+    return page(clips, corruptions, table, alarms, details)
+
+
 def main() -> None:
-    """Render what is not there, check everything, write the page."""
+    """Examine the unusual clips and, apart, those that no constant was chosen on; write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clips", type=Path, help="folder to keep the rendered clips in")
-    parser.add_argument(
-        "--only", default="", help="clips and corruptions whose names contain this, separated by commas"
-    )
+    parser.add_argument("--only", choices=("unusual", "unseen"), help="one of the two tables, printed alone")
     arguments = parser.parse_args()
+    parts = {"unusual": (CLIPS, "## Unusual clips"), "unseen": (UNSEEN, "## Clips that no constant was chosen on")}
+    text = [HEAD]
     with tempfile.TemporaryDirectory() as temporary:
-        root = arguments.clips or Path(temporary) / "clips"
-        only = [word for word in arguments.only.split(",") if word]
-        named = lambda name, all_names: not any(w in n for w in only for n in all_names) or any(w in name for w in only)
-        clips = [name for name in CLIPS if named(name, CLIPS)]
-        corruptions = [name for name in CORRUPTIONS if named(name, CORRUPTIONS)]
-        table, alarms, details = {}, {}, []
-        for clip in clips:
-            folder = root / clip.replace(" ", "-")
-            dataset = read_dataset(folder) if (folder / "dataset.json").exists() else render(clip, folder)
-            alarms[clip] = wrongs(dataset)
-            details += [f"- {clip}, as it is: {f.check}: {f.found}. {f.fix}" for f in alarms[clip]]
-            for name in corruptions:
-                verdict, found = outcome(
-                    dataset, CORRUPTIONS[name], Path(temporary) / f"{clip}-{name}".replace("/", "-")
-                )
-                table[clip, name] = verdict
-                print(f"{clip}, {name}: {verdict}", flush=True)
-                if verdict in (MISSED, MISLED):
-                    details += [f"- {clip}, {name}: {verdict}: {f.check}: {f.found}. {f.fix}" for f in found]
-                    details += [] if found else [f"- {clip}, {name}: {verdict}"]
-    text = page(clips, corruptions, table, alarms, details)
-    print(text)
-    if not only:
-        PAGE.write_text(text, encoding="utf-8")
+        for name, (clips, title) in parts.items():
+            if arguments.only in (None, name):
+                root = arguments.clips or Path(temporary) / "clips"
+                text += [title, "", examine(list(clips), list(CORRUPTIONS), root, Path(temporary))]
+    print("\n".join(text))
+    if arguments.only is None:
+        PAGE.write_text("\n".join(text), encoding="utf-8")
 
 
 def page(clips, corruptions, table, alarms, details) -> str:
@@ -74,12 +83,6 @@ def page(clips, corruptions, table, alarms, details) -> str:
     visible = [v for v in table.values() if v != SILENT]
     named = visible.count(RIGHT)
     lines = [
-        "# What `essjax check` says of unusual clips",
-        "",
-        "Made by `python -m tools.verdicts`; the clips are in `clips.py`, the corruptions in `corruptions.py`.",
-        "*named*: the right fix was told, and no other; *not decidable*: the corruption changes nothing that pictures",
-        "could show, and nothing is called wrong; *missed*: nothing is called wrong; *misled*: something else is.",
-        "",
         f"False alarms on the {len(clips)} clips as they are: **{sum(map(bool, alarms.values()))}**.",
         f"Named with the right fix: **{named} of {len(visible)}** ({named / max(len(visible), 1):.1%});",
         f"misled: {visible.count(MISLED)}, missed: {visible.count(MISSED)}.",
