@@ -1,4 +1,7 @@
-"""The public surface: lazy, named once, nothing that is there by accident."""
+"""The public surface: lazy, named once, nothing that is there by accident, and as ``api.txt`` records it.
+
+``python -m tests.test_api`` writes ``api.txt`` again, after a change that is meant.
+"""
 
 import ast
 import importlib
@@ -126,3 +129,31 @@ def test_the_wheel_holds_essjax_alone():
         setuptools = tomllib.load(file)["tool"]["setuptools"]
     assert setuptools["packages"]["find"] == {"include": ["essjax*"]}
     assert all(package.startswith("essjax.") for package in setuptools["package-data"])
+
+
+RECORD = ROOT / "tests" / "api.txt"
+
+
+def surface() -> str:
+    """One line per public name: a function with its arguments, a class with its fields, a method of a class too."""
+    return "".join(sorted(f"{name}{_arguments(value)}\n" for name, value in public()))
+
+
+def _arguments(value) -> str:
+    fields = getattr(value, "__dataclass_fields__", None) or getattr(value, "_fields", None)
+    if fields:
+        return f"({', '.join(fields)})"
+    if not inspect.isfunction(getattr(value, "__wrapped__", value)):
+        return ""
+    parameters = inspect.signature(value).parameters.values()
+    bare = [parameter.replace(default=parameter.empty, annotation=parameter.empty) for parameter in parameters]
+    return str(inspect.Signature(bare))
+
+
+def test_the_surface_is_as_recorded():
+    recorded, now = set(RECORD.read_text().splitlines()), set(surface().splitlines())
+    assert recorded == now, "if this is meant: python -m tests.test_api, and a line in CHANGELOG.md"
+
+
+if __name__ == "__main__":
+    RECORD.write_text(surface())
