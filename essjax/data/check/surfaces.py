@@ -38,9 +38,10 @@ OFFSETS = sorted(
     key=lambda offset: np.hypot(*offset),
 )  # fmt: skip
 """Pixels off the stated place at which an object is looked for; the first is that place."""
-ELSEWHERE = ((0.79, 0.015, 0.0), (0.65, 0.015, 0.4))
+ELSEWHERE = ((0.79, 0.015, 0.0, 0.0), (0.65, 0.015, 0.4, 1.5))
 """An object is elsewhere if the mismatch of its interior, or of all of it, is there less than this share of the stated
-one, and less by this much, and its blocks agree on so many pixels: outlines fit here and there by chance."""
+one, and less by this much, and its blocks agree on so many pixels, and there are more than so many blocks per frame:
+outlines fit here and there by chance."""
 OBJECTS, OBJECT_PIXELS, SAMPLES = 8, 30, 100
 """Objects that are looked for per frame, pixels that they and their blocks need, and pixels compared per block."""
 BLOCK, BLOCKS = 10, 12
@@ -300,8 +301,8 @@ def _objects(checks: Sequence[SurfaceCheck], *, held: bool) -> Mapping[int, np.n
         table = np.sum([check.objects[identity] for check in checks if identity in check.objects], axis=0)
         displaced = [
             row
-            for row, (share, gain, pixels) in zip(table, ELSEWHERE, strict=True)
-            if row[0] and row[2] < share * row[1] and row[1] - row[2] >= gain * row[0]
+            for row, (share, gain, pixels, blocks) in zip(table, ELSEWHERE, strict=True)
+            if row[0] > blocks * seen and row[2] < share * row[1] and row[1] - row[2] >= gain * row[0]
             if np.hypot(*row[3:]) >= pixels * row[0]
         ]
         if seen >= 2 and bool(displaced) != held:
