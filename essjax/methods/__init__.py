@@ -5,7 +5,7 @@ from essjax.methods._composed import composed, settled, with_taa
 from essjax.methods._dlctus import dlctus
 from essjax.methods._extranet import extranet
 from essjax.methods._extranet import from_torch as extranet_from_torch
-from essjax.methods._extrass import extrass as _extrass
+from essjax.methods._extrass import extrass
 from essjax.methods._fasset import fasset
 from essjax.methods._ifrnet import ifrnet
 from essjax.methods._nsrr import nsrr
@@ -14,10 +14,8 @@ from essjax.methods.baselines import bicubic, bilinear, gaussian_blur, jau, jau_
 from essjax.methods.extrass_low import extrass_e, extrass_w
 from essjax.methods.fasset_baselines import extranet_nsrr, extranet_plus, nsrr_extranet
 from essjax.methods.interpolation import bsr, warp_3d
-from essjax.methods.registry import make, registered
+from essjax.methods.registry import make
 from essjax.methods.weights import load, save
-
-extrass = registered(_extrass)
 
 __all__ = [
     "bicubic", "bilinear", "bsr", "classifier", "composed", "dlctus", "extranet", "extranet_from_torch",

@@ -22,6 +22,7 @@ from essjax.frames import (
 )
 from essjax.interfaces import Method, MethodInfo, Parted, Parts, from_parts, reset_at_cut
 from essjax.methods.extrass_low import Extrapolated, extrapolate, frnet_inputs
+from essjax.methods.registry import registered
 from essjax.methods.rendered import (
     GUIDED,
     Memory,
@@ -53,7 +54,7 @@ from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
 
 @pytree
 class Past:
-    """What earlier frames leave, whatever was shown of them.
+    """The memory of earlier frames, whatever was shown of them.
 
     Attributes:
       rendered: the two latest rendered LR frames.
@@ -70,7 +71,7 @@ class Past:
 
 @pytree
 class Notes:
-    """What of it concerns the current frame.
+    """The part of the memory that concerns the current frame.
 
     Attributes:
       rendered: the two latest rendered frames with their paths from the current one, newest first; None if that is
@@ -145,13 +146,13 @@ def trusted(frame: Frame, gbuffers: GBuffers, jitter: Jitter) -> Mask:
 
 
 def warp_shown(image: Color, motion: Motion) -> Color:
-    """The last output, linear, along ``motion``; returns log1p."""
+    """Warp the last output, linear, along ``motion``; return log1p."""
     # Bicubic: bilinear would blur the history a little more with every frame. Of x / (1 + x): bright pixels would ring.
     return log1p_of_reinhard(backward_warp(reinhard(image), motion, mode="bicubic"))
 
 
 def _mean_of_nine(mask: Mask) -> Mask:
-    """The mean over each pixel and its eight neighbours, borders repeated."""
+    """Average each pixel and its eight neighbours, borders repeated."""
     for axis in (mask.ndim - 3, mask.ndim - 2):
         padded = jnp.pad(mask, [(int(k == axis),) * 2 for k in range(mask.ndim)], mode="edge")
         mask = sum(jax.lax.slice_in_dim(padded, k, k + mask.shape[axis], axis=axis) for k in range(3)) / 3.0
@@ -159,7 +160,7 @@ def _mean_of_nine(mask: Mask) -> Mask:
 
 
 def _prior(valid: Mask, weight: Array | float) -> Array:
-    """Logit of the current sample's share before training: ``weight`` on trusted history, most of it elsewhere."""
+    """Return the logit of the sample's share before training: ``weight`` on trusted history, most of it elsewhere."""
     share = valid * weight + (1.0 - valid) * jnp.maximum(weight, HOLE_SHARE)
     return jnp.log(share) - jnp.log(1.0 - share)  # never near 1: log1p would cost more and gain nothing
 
@@ -194,6 +195,7 @@ def _compose(head: Array, warped: Color, seen: Seen, scale: int) -> Image:
     return history + share * (current.color - history) + output[..., 2:]
 
 
+@registered
 def extrass(
     *,
     width: int = 24,

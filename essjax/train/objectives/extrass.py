@@ -1,4 +1,4 @@
-"""What ExtraSS's two stages minimise.
+"""The losses of ExtraSS's two stages.
 
 A clip is unrolled twice, one frame apart, so that every inner frame is predicted as SS and as ESS, each from the
 history that the alternation gives it at inference (ExtraSS section 4.5; docs/deviations.md says why not from one shared
