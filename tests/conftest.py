@@ -20,16 +20,34 @@ hypothesis.settings.register_profile("ci", parent=hypothesis.settings.get_profil
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "default")
 
 
+CACHE = "ESSJAX_TESTS_CACHE"
+
+
+def pytest_configure(config):
+    """One compilation cache for all workers, which inherit the environment; nothing outlives the run."""
+    if not hasattr(config, "workerinput"):
+        config.stash[_FOLDER] = tempfile.TemporaryDirectory(prefix="essjax-tests-", ignore_cleanup_errors=True)
+        os.environ[CACHE] = config.stash[_FOLDER].name
+
+
+def pytest_unconfigure(config):
+    """Remove it."""
+    if _FOLDER in config.stash:
+        config.stash[_FOLDER].cleanup()
+
+
+_FOLDER = pytest.StashKey[tempfile.TemporaryDirectory]()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def compilation_cache():
-    """Programs compiled twice in one run (new closures, subprocesses) are compiled once; nothing outlives the run."""
-    with tempfile.TemporaryDirectory(prefix="essjax-tests-", ignore_cleanup_errors=True) as folder:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder  # subprocesses
-        jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-        yield
-        jax.config.update("jax_compilation_cache_dir", None)
-        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    """Programs compiled twice in one run (new closures, other files, subprocesses) are compiled once."""
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ[CACHE]  # subprocesses
+    jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    yield
+    jax.config.update("jax_compilation_cache_dir", None)
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
 
 
 @pytest.fixture

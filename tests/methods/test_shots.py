@@ -43,7 +43,7 @@ METHODS = {
     "with_taa, late": methods.with_taa(methods.warp_3d()),
 }
 NO_METHODS = {
-    "composed", "extranet_from_torch", "gaussian_blur", "jau_image", "settled",
+    "composed", "extranet_from_torch", "gaussian_blur", "jau_image", "load", "make", "save", "settled",
 }  # fmt: skip
 
 

@@ -117,7 +117,7 @@ def test_the_page_of_a_gpu_shows_its_own_time(result):
     result["rows"][0]["device_ms"] = 1.5
     page = section("benchmark-warp", result)
     assert "| thing, 4x4 | essjax | 2 | 0.1 | 1.5 |  | 2000 Mpixels/s |" in page
-    assert "10 calls one behind the other" in page
+    assert "10 calls one after the other" in page
 
 
 def test_the_page_shows_ratios_and_rates(result):
