@@ -10,7 +10,7 @@ FRNET = {
     #                       smoke quick paper
     "frnet.learning_rate": (1e-3, 1e-3, 1e-4),
     "frnet.steps":         (4,    None, 100 * 900),
-    "frnet.seconds":       (None, 15.0, None),
+    "frnet.seconds":       (None, 30.0, None),
 }  # fmt: skip
 LOW = {"width": "frnet_width"}
 """The low-resolution part's arguments, in the whole."""
