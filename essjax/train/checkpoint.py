@@ -162,7 +162,7 @@ def _checksums(folder: Path) -> dict[str, str]:
 
 
 def _damage(folder: Path) -> str:
-    """What is wrong with a checkpoint's files; nothing if they are as they were written."""
+    """Say what is wrong with a checkpoint's files; "" if nothing is."""
     try:
         lines = (folder / SUMS).read_bytes().decode().splitlines()
         found = _checksums(folder)
