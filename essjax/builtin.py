@@ -19,6 +19,7 @@ from essjax.scenes import (
     split_seeds,
 )
 from essjax.scenes.sequence import USUAL
+from essjax.stopping import finishing
 
 RENDERER = "essjax.scenes 3"
 """How datasets of the built-in renderer name it; the number grows when the same seed gives another picture."""
@@ -149,6 +150,7 @@ def generate(
 
     Raises:
       ValueError: the folder holds data made with other settings, or a setting is invalid.
+      Interrupted: a signal came; the frames so far are there.
     """
     out, clips = Path(out), list(clips)
     shared = {"renderer": RENDERER, "width": width, "height": height, "scale": rendering.scale}
@@ -156,12 +158,15 @@ def generate(
     shared |= {key: value for key, value in rendering._asdict().items() if value != UNSAID.get(key, value)}
     splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
+    so_far = lambda: f"{done + 1} of {total} frames are there. Run the same command again to resume."
     for clip in clips:
         scene = make_scene(clip.family, clip.seed, clip.frames)
         writer = SequenceWriter(out, clip.name, source={**shared, **clip._asdict()})
         for index in range(clip.frames):
             if index not in writer:
-                writer.write(index, render_frame(scene, index, width, height, rendering=clip.rendered(rendering)))
+                frame = render_frame(scene, index, width, height, rendering=clip.rendered(rendering))
+                with finishing(so_far):
+                    writer.write(index, frame)
             done += 1
             progress(done, total)
         writer.finish()

@@ -20,6 +20,7 @@ from essjax.data.guess import guess_recipe, to_toml
 from essjax.data.importing.draft import CERTAIN, LIKELY, UNKNOWN
 from essjax.data.layout import read_dataset, write_json
 from essjax.scenes import Rendering
+from essjax.stopping import Interrupted, stoppable
 
 _console = Console()
 
@@ -304,9 +305,16 @@ COMMANDS: dict[str, Callable[..., int | None]] = {"scenes": scenes, "import": im
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; bad input and a failing disk print one line and return 2, Ctrl-C returns 130."""
+    """Run a command; bad input and a failing disk print one line and return 2, Ctrl-C returns 130, SIGTERM 143."""
+
+    def command() -> int:
+        return tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv) or 0
+
     try:
-        code = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv)
+        return stoppable(command, _say_waiting, _say_stopped)
+    except Interrupted as stop:
+        _console.print(f"interrupted: {stop}", markup=False, highlight=False, soft_wrap=True)
+        return stop.code
     except ValueError as error:
         _console.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         return 2
@@ -316,9 +324,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         _console.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
-        _console.print("interrupted; run the same command again to resume.")
+        _say_stopped()
         return 130
-    return code or 0
+
+
+def _say_waiting() -> None:
+    _console.print("stopping after the frames in hand; once more to stop at once", soft_wrap=True)
+
+
+def _say_stopped() -> None:
+    _console.show_cursor()  # progress bars hide it
+    _console.print("interrupted; run the same command again to resume.", soft_wrap=True)
 
 
 if __name__ == "__main__":

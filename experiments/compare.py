@@ -30,7 +30,7 @@ def parse(arguments: Sequence[str] | None = None) -> CompareOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2, a signal 130, a run with a dead network 1."""
+    """Run the command; returns 2 after a line about bad input, 130 or 143 after a signal, 1 for a dead network."""
     options = parse(arguments)
     return guarded(lambda console: _compare(options, console))
 

@@ -81,24 +81,34 @@ def parse(arguments: Sequence[str] | None = None) -> RunOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2, a signal 130, a run with a dead network 1."""
+    """Run the command; returns 2 after a line about bad input, 130 or 143 after a signal, 1 for a dead network."""
     options = parse(arguments)
     return guarded(lambda console: _run(options, console))
 
 
-def guarded(command: Callable[[Console], int]) -> int:
-    """Run ``command``; bad input prints one line and returns 2, a signal 130."""
-    console = Console()
-    try:
-        return command(console)
-    except (ValueError, RuntimeError, OSError) as error:
-        from essjax.train import Interrupted
+def guarded(command: Callable[[Console], int], again: str = "Run the same command with --resume to continue.") -> int:
+    """Run ``command``; returns 2 after a line about bad input, 130 (Ctrl-C) or 143 (SIGTERM) and ``again``."""
+    from essjax.stopping import Interrupted, stoppable
 
-        stopped = isinstance(error, Interrupted)
-        print_error(error, console, "Stopped" if stopped else "Error")
-        return 130 if stopped else 2
+    console = Console()
+
+    def waiting() -> None:
+        console.print("Stopping after this step; once more to stop at once.", soft_wrap=True)
+
+    def stopped() -> None:
+        console.show_cursor()  # progress bars hide it
+        console.print(Text.assemble(("Stopped.", "red"), f" {again}"), soft_wrap=True)
+
+    try:
+        return stoppable(lambda: command(console), waiting, stopped)
+    except Interrupted as stop:
+        print_error(stop, console, "Stopped")
+        return stop.code
+    except (ValueError, RuntimeError, OSError) as error:
+        print_error(error, console)
+        return 2
     except KeyboardInterrupt:
-        console.print("[red]Stopped.[/red] Run the same command with --resume to continue.")
+        stopped()
         return 130
 
 

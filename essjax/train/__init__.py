@@ -1,9 +1,9 @@
 """Training: objectives, one jitted step, the loop, checkpoints."""
 
+from essjax.stopping import Interrupted
 from essjax.train.checkpoint import Checkpoints
 from essjax.train.loop import (
     Budget,
-    Interrupted,
     NonFiniteLoss,
     Validation,
     best_validation,

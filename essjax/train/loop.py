@@ -4,7 +4,6 @@ The clock counts training: a step with the wait for its batch, but neither compi
 """
 
 import json
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,13 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax.stopping import finishing
 from essjax.train.checkpoint import Checkpoints
 from essjax.train.state import TrainState, averaged
 from essjax.typing import PyTree
-
-
-class Interrupted(RuntimeError):
-    """Training was asked to stop (SIGTERM, Ctrl-C); the state is saved."""
 
 
 class NonFiniteLoss(RuntimeError):
@@ -98,7 +94,7 @@ def train(
       of the start, which is not kept; ``terms`` of the last step.
 
     Raises:
-      Interrupted: a signal came; everything is saved.
+      Interrupted: a signal came, see ``essjax.stopping``; everything is saved.
       NonFiniteLoss: names the terms; the batch is in ``log_path``'s folder.
     """
     spent, best = read_progress({}), state.variables[trained]
@@ -110,7 +106,8 @@ def train(
     step, terms = int(state.step), {}
     _truncate(log_path, step)
     last_save = time.monotonic()
-    with _SignalFlag() as stop, log_path.open("a") as log:
+    saved = lambda: f"stopped at step {step}; the state is saved. Run the same command with --resume."
+    with finishing(saved) as section, log_path.open("a") as log:
 
         def save():
             log.flush()
@@ -132,14 +129,16 @@ def train(
             on_validation(step, progress(), scores)
 
         if validation and not spent["validated"] and progress() < 1.0:
-            validate(validation)
-        while progress() < 1.0 and not stop.set:
+            with section.at_rest():
+                validate(validation)
+        while progress() < 1.0 and not section.asked:
             began = time.monotonic()
             batch, rate = next(batches), schedule(step, progress())
             if hasattr(step_function, "lower"):
                 on_compile()
                 began = time.monotonic()
-                step_function = step_function.lower(state, batch, rate).compile()
+                with section.at_rest():
+                    step_function = step_function.lower(state, batch, rate).compile()
                 spent["compile_seconds"] += time.monotonic() - began
                 began = time.monotonic()
             state, terms = step_function(state, batch, rate)
@@ -156,8 +155,6 @@ def train(
                 save()
                 last_save = time.monotonic()
         save()
-        if stop.set and progress() < 1.0:
-            raise Interrupted(f"stopped at step {step}; the state is saved. Run the same command with --resume.")
     return chosen_variables(state, best, trained, spent), {"steps": step, **spent, "terms": terms}
 
 
@@ -211,22 +208,3 @@ def _truncate(path: Path, step: int) -> None:
     if path.exists():
         lines = path.read_text().splitlines()[:step]
         path.write_text("".join(line + "\n" for line in lines))
-
-
-class _SignalFlag:
-    """Turns SIGTERM and SIGINT into a flag while it is entered, so that a step is never torn."""
-
-    def __enter__(self):
-        self.set = False
-        try:
-            self._previous = {s: signal.signal(s, self._raise_flag) for s in (signal.SIGTERM, signal.SIGINT)}
-        except ValueError:  # not the main thread: signals stay as they are
-            self._previous = {}
-        return self
-
-    def _raise_flag(self, signum, stack):
-        self.set = True
-
-    def __exit__(self, *error):
-        for signum, handler in self._previous.items():
-            signal.signal(signum, handler)

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from experiments.benchmark.schema import SIZE
-from experiments.run import parse_as, print_error
+from experiments.run import guarded, parse_as
 
 SUITES = ("warp", "networks", "pipeline", "train", "scenes")
 
@@ -48,13 +48,9 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2."""
-    options, console = parse(arguments), Console()
-    try:
-        return _benchmark(options, console)
-    except (ValueError, RuntimeError, OSError) as error:
-        print_error(error, console)
-        return 2
+    """Run the command; bad input prints one line and returns 2, Ctrl-C 130, SIGTERM 143."""
+    options = parse(arguments)
+    return guarded(lambda console: _benchmark(options, console), "What was measured so far is in *.partial.")
 
 
 def _size(text: str) -> tuple[int, int]:

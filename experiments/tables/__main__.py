@@ -26,7 +26,7 @@ def parse(arguments: Sequence[str] | None = None) -> TablesOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2, a signal 130."""
+    """Run the command; bad input prints one line and returns 2, Ctrl-C 130, SIGTERM 143."""
     options = parse(arguments)
     return guarded(lambda console: _tables(options, console))
 

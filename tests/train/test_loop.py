@@ -66,15 +66,6 @@ def test_signal_stops_after_the_step_and_resumes_exactly(tmp_path, uninterrupted
     assert_same_run(tmp_path, state, uninterrupted)
 
 
-def test_signal_in_the_last_step_is_the_end(tmp_path, uninterrupted):
-    def on_step(step, progress, terms):
-        if step == tiny_run.STEPS:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    state, _ = tiny_run.run(tmp_path, on_step=on_step)
-    assert_same_run(tmp_path, state, uninterrupted)
-
-
 def test_kill_9_and_resume(tmp_path, uninterrupted):
     arguments = [sys.executable, "-m", "tests.train.tiny_run", str(tmp_path), "0.15"]
     process = subprocess.Popen(arguments, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE)

@@ -14,6 +14,7 @@ import numpy as np
 from essjax.data.layout import SequenceInfo
 from essjax.data.store import DISAGREES, PreparedFrame, SequenceWriter
 from essjax.frames import Frame, Sequence
+from essjax.stopping import finishing
 
 SAVE_EVERY = 16
 """Frames between two writes of ``sequence.json``: what a killed import loses at most."""
@@ -169,11 +170,18 @@ def write_clip(
       ValueError: a frame is broken (and ``skip_broken`` is off); no frame is left, or most differ
         from the first in size or channels; a file cannot be written.
       OSError: a file cannot be read or written.
+      Interrupted: a signal came; the frames so far are there.
     """
     clip, writer, pending = opened
     on_frames(len(clip.numbers) - len(pending))
     frames = _prepared(opened, workers or os.cpu_count() or 1)
-    with closing(frames), _saved_at_last(writer):
+    left = len(pending)
+
+    def saved() -> str:
+        done = len(clip.numbers) - left
+        return f"{done} of {len(clip.numbers)} frames of {clip.name} are there. Run the same command again to resume."
+
+    with finishing(saved) as section, closing(frames), _saved_at_last(writer):
         for index, (number, future) in enumerate(frames):
             try:
                 _commit(writer, number, future, save=index % SAVE_EVERY == 0)
@@ -181,7 +189,10 @@ def write_clip(
                 if not skip_broken:
                     raise ValueError(f"sequence {clip.name}, frame {number}: {error}{hint(opened, number)}") from error
                 writer.skip(number, str(error), error.made_from)
+            left -= 1
             on_frames(1)
+            if section.asked:
+                break
     skipped = {number: writer.skipped[number]["reason"] for number in sorted(writer.skipped)}
     if writer.info is None:
         raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {next(iter(skipped.values()))}")
