@@ -13,8 +13,8 @@ from types import ModuleType
 __version__ = "0.1.0"
 
 __all__ = [
-    "buffers", "builtin", "cameras", "color", "data", "deploy", "exposure", "frames", "interfaces", "kernels", "labels",
-    "losses", "methods", "metrics", "networks", "rollout", "scenes", "stopping", "tensors", "train", "typing",
+    "buffers", "builtin", "cameras", "color", "data", "deploy", "exposure", "files", "frames", "interfaces", "kernels",
+    "labels", "losses", "methods", "metrics", "networks", "rollout", "scenes", "stopping", "tensors", "train", "typing",
     "warp",
 ]  # fmt: skip
 

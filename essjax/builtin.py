@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import essjax.frames
 from essjax.data import CachedSource, Dataset, SequenceWriter, read_dataset, write_dataset
+from essjax.files import only_writer
 from essjax.scenes import (
     EXTRA_FAMILIES,
     FAMILIES,
@@ -149,10 +150,17 @@ def generate(
       progress: called after each frame.
 
     Raises:
-      ValueError: the folder holds data made with other settings, or a setting is invalid.
+      ValueError: the folder holds data made with other settings, another command writes into it, or a setting is
+        invalid.
       Interrupted: a signal came; the frames so far are there.
     """
-    out, clips = Path(out), list(clips)
+    with only_writer(out):
+        return _generate(Path(out), list(clips), width, height, rendering, progress)
+
+
+def _generate(
+    out: Path, clips: Sequence[Clip], width: int, height: int, rendering: Rendering, progress: Progress
+) -> Dataset:
     shared = {"renderer": RENDERER, "width": width, "height": height, "scale": rendering.scale}
     shared["mip_bias"] = float(rendering.mip_bias)
     shared |= {key: value for key, value in rendering._asdict().items() if value != UNSAID.get(key, value)}

@@ -19,6 +19,7 @@ from essjax.data.check import CheckReport, check_dataset
 from essjax.data.guess import guess_recipe, to_toml
 from essjax.data.importing.draft import CERTAIN, LIKELY, UNKNOWN
 from essjax.data.layout import read_dataset, write_json
+from essjax.files import atomic
 from essjax.scenes import Rendering
 from essjax.stopping import Interrupted, stoppable
 
@@ -246,7 +247,8 @@ def _guess(source: Path, out: Path) -> tuple[str, Path | None]:
     if found.preset != "generic":
         return found.preset, None
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(to_toml(found.content, found.notes), encoding="utf-8")
+    with atomic(path) as temporary:
+        temporary.write_text(to_toml(found.content, found.notes), encoding="utf-8")
     _console.print(f"wrote {path}: look at what is unknown, then:", markup=False, soft_wrap=True)
     return found.preset, path
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from essjax.data import Dataset, read_dataset
 from essjax.data.layout import write_json
 from essjax.deploy import method_cost
+from essjax.files import only_writer
 from essjax.methods import save
 from essjax.typing import PyTree
 from experiments import datasets, health
@@ -102,10 +103,15 @@ def run_experiment(request: Request, console: Console) -> dict[str, Any]:
 
     Raises:
       ValueError: unknown variant, preset or setting, settings or data that do not fit, or of which no frame would be
-        scored, or ``out`` holds another run.
+        scored, or ``out`` holds another run or is being written by another command.
     """
-    settings, clock = all_settings(request.names, request.preset, request.overrides), Clock()
-    record = run_record(request, settings)
+    settings = all_settings(request.names, request.preset, request.overrides)
+    with only_writer(request.out):
+        return _run_experiment(request, settings, console)
+
+
+def _run_experiment(request: Request, settings: Mapping[str, Settings], console: Console) -> dict[str, Any]:
+    record, clock = run_record(request, settings), Clock()
     check_folder(request.out, record, resume=request.resume, eval_only=request.eval_only)
     if request.tensorboard:
         check_installed()

@@ -52,12 +52,9 @@ def check_folder(out: Path, wanted: Mapping[str, Any], *, resume: bool, eval_onl
     Nothing is written: a run that finds no data leaves nothing that stands in the way of the next.
 
     Raises:
-      ValueError: ``out`` is no folder, holds another run, or one that was not asked to continue.
+      ValueError: ``out`` holds another run, or one that was not asked to continue.
     """
     path, wanted = out / "run.json", json.loads(json.dumps(wanted))
-    file = next((folder for folder in (out, *out.parents) if folder.exists() and not folder.is_dir()), None)
-    if file:
-        raise ValueError(f"--out {out}: expected a folder, but {file} is a file. Choose another --out.")
     if path.exists():
         found = read_json(path)
         if not (resume or eval_only):

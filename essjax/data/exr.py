@@ -8,8 +8,7 @@ lines about damaged files still go to stdout and stderr.
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,7 @@ import OpenEXR
 
 from essjax.buffers import DEPTHS, FULL_PRECISION
 from essjax.data.exr_text import readable
+from essjax.files import atomic
 
 HALF_MAX = 65504.0
 SMALL_IMAGE = 512 << 20
@@ -29,18 +29,6 @@ SHOWN = 12
 """Channel names in a message."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _LFS = b"version https://git-lfs"
-
-
-@contextmanager
-def atomic(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that replaces it on success and is removed on failure."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def layer(channel: str) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 
 from essjax.buffers import BUFFERS, MASKS, RANGES
 from essjax.cameras import Camera
-from essjax.data import exr
+from essjax.files import atomic
 
 SCHEMA = 1
 SUFFIXES = {**{name: buffer.suffixes for name, buffer in BUFFERS.items()}, **dict.fromkeys(MASKS, "Y")}
@@ -154,7 +154,7 @@ def _format(content: Mapping) -> str:
 
 def write_json(path: Path, content: Mapping) -> None:
     """Write JSON atomically."""
-    with exr.atomic(path) as temporary:
+    with atomic(path) as temporary:
         temporary.write_text(_format(content), encoding="utf-8")
 
 

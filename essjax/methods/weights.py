@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 import essjax
+from essjax.files import atomic
 from essjax.frames import example_frame
 from essjax.interfaces import Method
 from essjax.methods.registry import make
@@ -42,9 +43,8 @@ def save(path: str | Path, method: Method, variables: PyTree) -> None:
     header = {"format": FORMAT, "version": essjax.__version__, **_described(method), **_facts(method)}
     header["checksum"] = _checksum(header, tensors)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
-    temporary.replace(path)
+    with atomic(path) as temporary:
+        save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
 
 
 def load(path: str | Path) -> tuple[Method, PyTree]:

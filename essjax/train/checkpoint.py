@@ -9,6 +9,7 @@ A checkpoint has another name until all of it is there. One that does not fit it
 and the newest whole one takes its place.
 """
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from essjax.files import only_writer
 from essjax.typing import PyTree
 
 KEPT = 2
@@ -34,6 +36,7 @@ class Checkpoints:
     """The checkpoints of one stage in one folder; the newest two are kept.
 
     A save that is killed midway leaves only a temporary folder behind, which is not listed; the next save removes it.
+    From the first save to ``close`` nobody else can save there.
 
     Args:
       path: the folder; made by the first save.
@@ -43,6 +46,7 @@ class Checkpoints:
         self.path = Path(path).absolute()
         self._orbax = ocp.Checkpointer(ocp.StandardCheckpointHandler())
         self._damaged: set[int] = set()
+        self._holds, self._held = False, contextlib.ExitStack()
 
     def _steps(self) -> list[int]:
         """Return the steps of all checkpoints, newest first."""
@@ -57,8 +61,11 @@ class Checkpoints:
         """Write ``state`` (arrays) and ``progress`` (JSON) as checkpoint ``step``; does nothing if it exists.
 
         Raises:
-          ValueError: it cannot be written; the checkpoints before it are as they were.
+          ValueError: it cannot be written, or another process saves there; the checkpoints before it are as they were.
         """
+        if not self._holds:
+            self._held.enter_context(only_writer(self.path))
+            self._holds = True
         for damaged in self._damaged:  # found so while restoring, and not needed: training goes on from another one
             shutil.rmtree(self.path / str(damaged), ignore_errors=True)
         self._damaged.clear()
@@ -66,7 +73,6 @@ class Checkpoints:
             return
         temporary = self.path / f"{step}{_TEMPORARY}"
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
             for leftover in self.path.glob(f"*{_TEMPORARY}"):
                 shutil.rmtree(leftover)
             self._orbax.save(temporary / "state", args=ocp.args.StandardSave(state))
@@ -136,8 +142,10 @@ class Checkpoints:
         return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), restored), progress
 
     def close(self) -> None:
-        """Release orbax's threads."""
+        """Release orbax's threads and the folder."""
         self._orbax.close()
+        self._held.close()
+        self._holds = False
 
 
 _log = logging.getLogger(__name__)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from essjax.files import atomic
 from essjax.stopping import finishing
 from essjax.train.checkpoint import Checkpoints
 from essjax.train.state import TrainState, averaged
@@ -207,4 +208,5 @@ def _truncate(path: Path, step: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
         lines = path.read_text().splitlines()[:step]
-        path.write_text("".join(line + "\n" for line in lines))
+        with atomic(path) as temporary:
+            temporary.write_text("".join(line + "\n" for line in lines))

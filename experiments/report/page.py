@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from essjax.files import atomic
 from experiments.report import images as pixels
 from experiments.report.learning import learning_section
 from experiments.report.pictures import Picture, make_picture
@@ -73,9 +74,9 @@ def write_report(
         notes.append(f"{left_out} of {len(chosen)} pictures were left out to keep this page small.")
     _write_sheets(sheets, chosen)
     path = folder / "index.html"
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(_page(metrics, curves or {}, data, notes, references or {}, training or {}), encoding="utf-8")
-    temporary.replace(path)
+    with atomic(path) as temporary:
+        text = _page(metrics, curves or {}, data, notes, references or {}, training or {})
+        temporary.write_text(text, encoding="utf-8")
     return path
 
 

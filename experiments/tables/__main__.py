@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _tables(options: TablesOptions, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
     from essjax.data.layout import write_json
+    from essjax.files import atomic
     from experiments import tables
 
     if options.list:
@@ -50,7 +51,8 @@ def _tables(options: TablesOptions, console: Console) -> int:
         results["tables"] |= filled
         write_json(out / "tables.json", results)  # an interrupted command leaves what is finished
     page = "\n".join(tables.markdown(table, results["tables"][table.name]) for table in chosen)
-    (out / "tables.md").write_text(page)
+    with atomic(out / "tables.md") as temporary:
+        temporary.write_text(page)
     console.print(page, soft_wrap=True, highlight=False)
     console.print(f"tables: {out / 'tables.md'}, numbers: {out / 'tables.json'}", soft_wrap=True)
     return 0

@@ -5,6 +5,7 @@ import OpenEXR
 import pytest
 
 from essjax.data import exr
+from essjax.files import atomic
 
 
 def planes(height=5, width=7):
@@ -74,7 +75,7 @@ def test_bad_arrays_are_refused(tmp_path):
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.exr"
     exr.write(path, {"R": np.ones((2, 2))})
-    with pytest.raises(RuntimeError, match="interrupted"), exr.atomic(path) as temporary:
+    with pytest.raises(RuntimeError, match="interrupted"), atomic(path) as temporary:
         temporary.write_bytes(b"half a file")
         raise RuntimeError("interrupted")
     np.testing.assert_array_equal(exr.read(path)["R"], np.ones((2, 2)))

@@ -69,7 +69,7 @@ def test_a_file_in_the_way_of_the_folder(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         assert run.main(["--preset", "smoke", "--data", "nowhere", "--out", str(out)]) == 2
-        assert f"--out {out}: expected a folder, but {tmp_path / 'file'} is a file. Choose" in printed(capsys)
+        assert f"{out}: expected a folder, but {tmp_path / 'file'} is a file. Choose" in printed(capsys)
 
 
 def test_errors_of_the_disk_are_one_line(tmp_path, capsys):

@@ -19,7 +19,7 @@ from tests.train import tiny_run
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
-def start(body, **options):
+def start(body, before=""):
     """A Python process that runs ``body`` as a command, in an own session like a terminal's foreground job."""
     script = textwrap.dedent("""
         import sys, time
@@ -35,7 +35,8 @@ def start(body, **options):
             code = stop.code
         sys.exit(code)
     """).replace("BODY", textwrap.indent(textwrap.dedent(body), "    "))
-    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, **options)
+    command = ["sh", "-c", f'{before} exec "$@"', "sh", sys.executable, "-c", script]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
 def until(process, line):
@@ -97,8 +98,7 @@ def test_the_second_signal_ends_it_now():
 
 def test_what_is_ignored_stays_ignored():
     """As a shell starts jobs in the background, and nohup anything."""
-    ignore = lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)
-    process = start("say('busy'); time.sleep(0.5); return 7", preexec_fn=ignore)
+    process = start("say('busy'); time.sleep(0.5); return 7", before="trap '' INT;")
     until(process, "busy")
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 7

@@ -23,6 +23,7 @@ from essjax.data.layout import (
     read_sequence_info,
     write_dataset,
 )
+from essjax.files import only_writer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,21 +196,22 @@ def import_dataset(
             raise ValueError(f"name: the dump has {len(clips)} sequences, which keep their names. Leave it out.")
         clips = [dataclasses.replace(clips[0], name=name)]  # type: ignore[type-var]
     gaps = {clip.name: _gaps(clip.name, clip.numbers, skip_broken) for clip in clips}
-    kept, about = _kept(Path(out), preset, clips, splits)
-    numbers = {name: info.numbers for name, info in kept.items()}
-    segments = split_segments({**numbers, **{clip.name: clip.numbers for clip in clips}}, splits)
-    opened = _open_all(Path(out), clips, kept, skip_broken)
-    written = _write(opened, skip_broken, workers, on_frame)
-    numbers |= {name: part.info.numbers for name, part in written.items()}
-    skipped = {name: {**gaps[name], **part.skipped} for name, part in written.items()}
-    skipped = {name: dict(sorted(frames.items())) for name, frames in skipped.items() if frames}
-    before = {name: frames for name, frames in about.get("skipped", {}).items() if name in kept}
-    about = {
-        "preset": preset,
-        "skipped": {**before, **{name: list(frames) for name, frames in skipped.items()}},
-        "splits": None if splits is None else {split: list(chosen) for split, chosen in splits.items()},
-    }
-    dataset = write_dataset(out, fit_segments(segments, numbers), source=about)
+    with only_writer(out):
+        kept, about = _kept(Path(out), preset, clips, splits)
+        numbers = {name: info.numbers for name, info in kept.items()}
+        segments = split_segments({**numbers, **{clip.name: clip.numbers for clip in clips}}, splits)
+        opened = _open_all(Path(out), clips, kept, skip_broken)
+        written = _write(opened, skip_broken, workers, on_frame)
+        numbers |= {name: part.info.numbers for name, part in written.items()}
+        skipped = {name: {**gaps[name], **part.skipped} for name, part in written.items()}
+        skipped = {name: dict(sorted(frames.items())) for name, frames in skipped.items() if frames}
+        before = {name: frames for name, frames in about.get("skipped", {}).items() if name in kept}
+        about = {
+            "preset": preset,
+            "skipped": {**before, **{name: list(frames) for name, frames in skipped.items()}},
+            "splits": None if splits is None else {split: list(chosen) for split, chosen in splits.items()},
+        }
+        dataset = write_dataset(out, fit_segments(segments, numbers), source=about)
     totals = _totals([part.info for part in written.values()])
     warnings += _still(totals)
     return ImportReport(dataset, totals, skipped, tuple(written), tuple(warnings))
