@@ -1,7 +1,8 @@
 """Named arrays from weight files that others trained: NumPy's ``.npz``, ``.safetensors``, PyTorch's ``.pth``.
 
 PyTorch's format is a pickle in a zip file. It is read without PyTorch and without running what the pickle names: only
-what rebuilds tensors is let through.
+what rebuilds tensors is let through. No file may declare much more than it holds: what is declared is bounded before
+memory is taken for it.
 """
 
 import collections
@@ -9,7 +10,7 @@ import json
 import math
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,27 @@ _STORAGES = {
     "LongStorage": "<i8", "IntStorage": "<i4", "ShortStorage": "<i2", "CharStorage": "<i1", "ByteStorage": "<u1",
     "BoolStorage": "<?",
 }  # fmt: skip
+
+
+SMALL = 64 << 20
+"""A file may always declare this many bytes of arrays ..."""
+MOST = 20
+"""... and this many more for each byte it has: weights are hardly compressible."""
+
+MOST_PICKLE = 4 << 20
+"""Bytes of a pickle without its tensors: tens of thousands of names."""
+
+
+def _allowed(path: Path) -> int:
+    """Bytes that the arrays of a file may have in all."""
+    return SMALL + MOST * path.stat().st_size
+
+
+def _check_zip(path: Path, entries: Iterable[zipfile.ZipInfo]) -> None:
+    """Raise a ValueError if a zip file would inflate to more than is allowed."""
+    declared = sum(entry.file_size for entry in entries)
+    if declared > _allowed(path):
+        raise ValueError(f"it inflates to {declared >> 20} MB, more than weights of this size do")
 
 
 def read_tensors(path: str | Path, what: str = "weights", *, prefix: str = "") -> dict[str, np.ndarray]:
@@ -50,11 +72,13 @@ def read_tensors(path: str | Path, what: str = "weights", *, prefix: str = "") -
     reader = {".npz": _read_npz, ".safetensors": _read_safetensors}.get(suffix, _read_torch)
     try:
         return reader(path, prefix)
-    except _ERRORS as error:
-        raise ValueError(f"{what}: {path} is damaged or not a {suffix} file ({error}).") from error
+    except Exception as error:  # damaged files raise whatever the libraries raise
+        raise ValueError(f"{what}: {path} is damaged or not a {suffix} file ({error!s:.300}).") from error
 
 
 def _read_npz(path: Path, prefix: str) -> dict[str, np.ndarray]:
+    with zipfile.ZipFile(path) as archive:
+        _check_zip(path, archive.infolist())
     with np.load(path, allow_pickle=False) as file:
         return {name: file[name] for name in file.files if name.startswith(prefix)}
 
@@ -75,13 +99,16 @@ def map_safetensors(path: Path) -> dict[str, np.ndarray]:
     """
     data = np.memmap(path, np.uint8, mode="r")
     header_end = 8 + int.from_bytes(data[:8].tobytes(), "little")
-    tensors = {}
+    tensors, total = {}, 0
     for name, entry in json.loads(data[8:header_end].tobytes()).items():
         if name == "__metadata__":
             continue
         if entry["dtype"] not in _SAFETENSORS_DTYPES:
             raise ValueError(f"{name} has dtype {entry['dtype']}, expected {', '.join(_SAFETENSORS_DTYPES)}")
         begin, end = entry["data_offsets"]
+        total += end - begin
+        if not 0 <= begin <= end or total > data.size:
+            raise ValueError(f"{name} lies at {begin}..{end}, and the file has {data.size} bytes for all")
         raw = data[header_end + begin : header_end + end]
         array = np.frombuffer(raw, _SAFETENSORS_DTYPES[entry["dtype"]]).reshape(entry["shape"])
         tensors[name] = _float32(array) if entry["dtype"] == "BF16" else array
@@ -92,14 +119,17 @@ def _read_torch(path: Path, prefix: str) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("not a zip file; files older than PyTorch 1.6 must be saved again by a newer one")
     with zipfile.ZipFile(path) as archive:
+        _check_zip(path, archive.infolist())
         pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise ValueError(f"expected one data.pkl in it, found {len(pickles)}")
+        if archive.getinfo(pickles[0]).file_size > MOST_PICKLE:
+            raise ValueError("its data.pkl is larger than that of any state dict")
         folder = pickles[0].removesuffix("data.pkl")
         if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":
             raise ValueError("big-endian storages are not supported")
         with archive.open(pickles[0]) as file:
-            content = _Unpickler(file, archive, folder).load()
+            content = _Unpickler(file, archive, folder, _allowed(path)).load()
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
     if not isinstance(content, Mapping):
@@ -111,53 +141,71 @@ def _read_torch(path: Path, prefix: str) -> dict[str, np.ndarray]:
     }
 
 
-def _rebuild_tensor(storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_) -> np.ndarray:
-    """Copy a strided view of a storage. Its bounds are checked: a file must not read other memory."""
-    size, stride = tuple(map(int, size)), tuple(map(int, stride))
-    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    if math.prod(size) and not (min((offset, *size, *stride)) >= 0 and last < storage.size):
-        raise ValueError(f"a tensor of size {size} and stride {stride} at {offset} leaves its storage")
-    steps = [step * storage.itemsize for step in stride]
-    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
-
-
 def _rebuild_parameter(tensor: np.ndarray, *_) -> np.ndarray:
     return tensor
 
 
-class _Unpickler(pickle.Unpickler):
-    """Lets a pickle call nothing but what builds dictionaries and tensors."""
+def _build(unpickler: "_Unpickler") -> None:
+    """Take the attributes of an object (a state dict's ``_metadata``) off the stack, and leave them."""
+    unpickler.stack.pop()
 
-    ALLOWED = {
-        ("collections", "OrderedDict"): collections.OrderedDict,
-        ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
-        ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
-        **{("torch", name): name for name in _STORAGES},
-    }
 
-    def __init__(self, file: Any, archive: zipfile.ZipFile, folder: str):
+class _Unpickler(pickle._Unpickler):  # the one in Python: the one in C takes memory for what an index of its memo says
+    """Lets a pickle call nothing but what builds dictionaries and tensors, and these of bounded size."""
+
+    dispatch = {**pickle._Unpickler.dispatch, pickle.BUILD[0]: _build}
+    for _opcode in (pickle.BYTEARRAY8, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER):  # protocol 5; PyTorch writes 2
+        del dispatch[_opcode[0]]
+
+    def __init__(self, file: Any, archive: zipfile.ZipFile, folder: str, allowed: int):
         super().__init__(file)
-        self._archive, self._folder = archive, folder
+        self._archive, self._folder, self._left = archive, folder, allowed
+        self._storages: dict[tuple, np.ndarray] = {}
+        self._known = {
+            ("collections", "OrderedDict"): collections.OrderedDict,
+            ("torch._utils", "_rebuild_tensor_v2"): self._rebuild_tensor,
+            ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
+            **{("torch", name): name for name in _STORAGES},
+        }
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         """Look up what a name in the pickle stands for."""
-        if (module_name, global_name) not in self.ALLOWED:
+        if (module_name, global_name) not in self._known:
             raise ValueError(f"it names {module_name}.{global_name}, which a state dict does not need: not loaded")
-        return self.ALLOWED[module_name, global_name]
+        return self._known[module_name, global_name]
 
     def persistent_load(self, pid: Any) -> np.ndarray:
-        """Read a storage from its own file in the archive."""
+        """Read a storage from its own file in the archive, once."""
         kind, storage, key, _, count = pid
         if kind != "storage" or storage not in _STORAGES:
             raise ValueError(f"unknown entry {kind} {storage}")
-        array = np.frombuffer(self._archive.read(f"{self._folder}data/{key}"), _STORAGES[storage])
+        if (storage, key) not in self._storages:
+            name = f"{self._folder}data/{key}"
+            self._take(self._archive.getinfo(name).file_size)
+            array = np.frombuffer(self._archive.read(name), _STORAGES[storage])
+            self._storages[storage, key] = _float32(array) if storage == "BFloat16Storage" else array
+        array = self._storages[storage, key]
         if array.size != count:
             raise ValueError(f"storage {key} holds {array.size} numbers, expected {count}")
-        return _float32(array) if storage == "BFloat16Storage" else array
+        return array
 
+    def _rebuild_tensor(
+        self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any
+    ) -> np.ndarray:
+        """Copy a strided view of a storage. Its bounds are checked: a file must not read other memory, nor fill it."""
+        if not isinstance(storage, np.ndarray) or storage.ndim != 1:
+            raise ValueError("a tensor without a storage")
+        numbers = (offset, *size, *stride)
+        fits = len(size) <= 32 and all(type(number) is int and 0 <= number < 1 << 48 for number in numbers)
+        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if fits else math.inf
+        if not fits or math.prod(size) and last >= storage.size:
+            raise ValueError(f"a tensor of size {size} and stride {stride} at {offset} leaves its storage")
+        self._take(math.prod(size) * storage.itemsize)
+        steps = [step * storage.itemsize for step in stride]
+        return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
 
-_ERRORS = (
-    OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, IndexError, pickle.UnpicklingError,
-    zipfile.BadZipFile,
-)  # fmt: skip
-"""The exceptions that readers raise on damaged files."""
+    def _take(self, count: int) -> None:
+        """Count bytes that are about to be taken."""
+        self._left -= count
+        if self._left < 0:
+            raise ValueError("its tensors are larger in all than weights in a file of this size are")
