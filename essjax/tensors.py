@@ -30,18 +30,18 @@ _STORAGES = {
 }  # fmt: skip
 
 
-SMALL = 64 << 20
+_SMALL = 64 << 20
 """A file may always declare this many bytes of arrays ..."""
-MOST = 20
+_MOST = 20
 """... and this many more for each byte it has: weights are hardly compressible."""
 
-MOST_PICKLE = 4 << 20
+_MOST_PICKLE = 4 << 20
 """Bytes of a pickle without its tensors: tens of thousands of names."""
 
 
 def _allowed(path: Path) -> int:
     """Bytes that the arrays of a file may have in all."""
-    return SMALL + MOST * path.stat().st_size
+    return _SMALL + _MOST * path.stat().st_size
 
 
 def _check_zip(path: Path, entries: Iterable[zipfile.ZipInfo]) -> None:
@@ -123,7 +123,7 @@ def _read_torch(path: Path, prefix: str) -> dict[str, np.ndarray]:
         pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise ValueError(f"expected one data.pkl in it, found {len(pickles)}")
-        if archive.getinfo(pickles[0]).file_size > MOST_PICKLE:
+        if archive.getinfo(pickles[0]).file_size > _MOST_PICKLE:
             raise ValueError("its data.pkl is larger than that of any state dict")
         folder = pickles[0].removesuffix("data.pkl")
         if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":

@@ -58,7 +58,7 @@ def test_random_damage_is_one_error(tmp_path):
 
 
 def test_a_zip_that_inflates(tmp_path, monkeypatch):
-    monkeypatch.setattr(essjax.tensors, "SMALL", 1 << 20)
+    monkeypatch.setattr(essjax.tensors, "_SMALL", 1 << 20)
     for suffix in (".pth", ".npz"):
         path = tmp_path / f"bomb{suffix}"
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -73,11 +73,11 @@ def test_tensors_larger_than_the_file(tmp_path, monkeypatch):
     endless = {"x": tensor("FloatStorage", "0", STORAGE, (1 << 20, 1 << 20), (0, 0))}
     path = save_torch(tmp_path / "endless.pth", endless, [("0", STORAGE)])
     refused(path, "its tensors are larger in all than weights in a file of this size are")
-    monkeypatch.setattr(essjax.tensors, "SMALL", 1 << 10)
+    monkeypatch.setattr(essjax.tensors, "_SMALL", 1 << 10)
     many = {f"x{n}": tensor("FloatStorage", "0", STORAGE, (12, 1000), (1, 0)) for n in range(9)}
     path = save_torch(tmp_path / "many.pth", many, [("0", STORAGE)])
     refused(path, "its tensors are larger in all")
-    monkeypatch.setattr(essjax.tensors, "SMALL", 64 << 20)
+    monkeypatch.setattr(essjax.tensors, "_SMALL", 64 << 20)
     assert read_tensors(path)["x8"].shape == (12, 1000)
     high = {"x": tensor("FloatStorage", "0", STORAGE, (1,) * 40, (1,) * 40)}
     refused(save_torch(tmp_path / "axes.pth", high, [("0", STORAGE)]), "leaves its storage")
