@@ -18,7 +18,8 @@ from essjax.data import Dataset, ImportReport, import_dataset
 from essjax.data.check import CheckReport, check_dataset
 from essjax.data.guess import guess_recipe, to_toml
 from essjax.data.importing.draft import CERTAIN, LIKELY, UNKNOWN
-from essjax.data.layout import read_dataset, write_json
+from essjax.data.json_files import write_json
+from essjax.data.layout import read_dataset
 from essjax.files import atomic
 from essjax.scenes import Rendering
 from essjax.stopping import Interrupted, stoppable

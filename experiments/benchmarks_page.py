@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from essjax.data.layout import write_json
+from essjax.data.json_files import write_json
 from experiments.benchmark.section import section
 from experiments.tables import get_table, markdown
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from essjax.data.layout import read_json, write_json
+from essjax.data.json_files import NUMBER, TEXT, check, read_json, write_json
 from essjax.frames import Sequence as FrameSequence
 from essjax.frames import frame_images, select_time
 from essjax.interfaces import Method, MethodInfo
@@ -89,7 +89,10 @@ def unfit(method: Method, sequence: FrameSequence) -> str:
 def _read_settings(path: Path) -> dict[str, Setting]:
     if not path.exists():
         return {}
-    return {row: Setting(**setting) for row, setting in read_json(path).items()}
+    content, fields = read_json(path), {"clamp": TEXT, "alpha": NUMBER, "sigma": NUMBER, "psnr": NUMBER}
+    for row, setting in content.items():
+        check(f"{path}: {row}", setting, fields)
+    return {row: Setting(*(setting[name] for name in fields)) for row, setting in content.items()}
 
 
 def table_references(runners: Mapping[str, Runner], scale: int) -> dict[str, str]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from essjax.data import Dataset, read_dataset
-from essjax.data.layout import write_json
+from essjax.data.json_files import write_json
 from essjax.deploy import method_cost
 from essjax.files import only_writer
 from essjax.methods import save

@@ -17,7 +17,7 @@ import OpenEXR
 import tyro
 
 from essjax.data import import_dataset
-from essjax.data.layout import write_json
+from essjax.data.json_files import write_json
 from experiments.benchmarks_page import RESULTS
 
 WIDTH, HEIGHT, DISTINCT = 960, 540, 8

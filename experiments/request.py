@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from essjax.data.layout import read_json
+from essjax.data.json_files import read_json
 from experiments.settings import Settings, flatten
 
 

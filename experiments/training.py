@@ -1,5 +1,6 @@
 """Train a variant: its stages in order, each resumable from its newest checkpoint."""
 
+import contextlib
 import functools
 import json
 import os
@@ -236,5 +237,10 @@ def restore_member(member: Member, dataset: Dataset, variables: PyTree) -> tuple
 def read_losses(out: Path, stage: str) -> list[tuple[int, float]]:
     """Step and loss of every step of a stage that was trained in ``out``; none where its log is gone."""
     path = out / "train" / f"{stage}.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    return [(line["step"], line["loss"]) for line in lines]
+    lines = path.read_text(errors="replace").splitlines() if path.exists() else []
+    found = []
+    for line in lines:
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # a killed run leaves half a line
+            entry = json.loads(line)
+            found.append((entry["step"], entry["loss"]))
+    return found

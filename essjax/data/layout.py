@@ -12,7 +12,6 @@ positions and motion float32, ids integers.
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -21,8 +20,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from essjax.buffers import BUFFERS, MASKS, RANGES
-from essjax.cameras import Camera
-from essjax.files import atomic
+from essjax.data.json_files import (
+    FLAG,
+    LIST,
+    NAME,
+    OBJECT,
+    POSITIVE,
+    TEXT,
+    Kind,
+    check,
+    is_name,
+    numbers,
+    or_null,
+    read_json,
+    shown,
+    whole,
+    write_json,
+)
 
 SCHEMA = 1
 SUFFIXES = {**{name: buffer.suffixes for name, buffer in BUFFERS.items()}, **dict.fromkeys(MASKS, "Y")}
@@ -31,6 +45,8 @@ KINDS = ("lr", "hr", "native", "ranges")
 """Kinds of files that a frame may consist of."""
 
 
+OPEN = ("exposure", "camera")
+"""What all frames of a sequence say, or none."""
 AGREE = ("width", "height", "scale", "channels", "ranges")
 """Fields of ``SequenceInfo`` in which all sequences of a dataset agree; frames of one agree in ``native`` as well."""
 
@@ -141,80 +157,87 @@ def frame_path(root: Path, name: str, kind: str, number: int) -> Path:
     return Path(root) / name / f"{kind}.{number:04d}.exr"
 
 
-def _format(content: Mapping) -> str:
-    """One line per field and per record of a list; ``indent`` would put every number of a matrix on its own."""
-    lines = []
-    for key, value in content.items():
-        text = json.dumps(value)
-        if isinstance(value, (list, tuple)) and value and isinstance(value[0], Mapping):
-            text = "[\n  " + ",\n  ".join(map(json.dumps, value)) + "\n ]"
-        lines.append(f" {json.dumps(key)}: {text}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def write_json(path: Path, content: Mapping) -> None:
-    """Write JSON atomically."""
-    with atomic(path) as temporary:
-        temporary.write_text(_format(content), encoding="utf-8")
-
-
-def read_json(path: Path) -> dict:
-    """Read a JSON object; missing and damaged files are ValueErrors that name the file."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: not found. Is this the right folder, and is the data complete?") from error
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected JSON, cannot read it ({error}).") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
-    return content
-
-
 def _schema(path: Path, content: dict) -> dict:
     if content.get("schema") != SCHEMA:
         raise ValueError(
-            f"{path}: expected schema {SCHEMA}, found {content.get('schema')!r}. "
+            f"{path}: expected schema {SCHEMA}, found {shown(content.get('schema'))}. "
             "Generate or import the dataset again with this version of essjax."
         )
     return content
 
 
-def _check_record(where: str, record: Any) -> None:
-    if not isinstance(record, dict) or type(record.get("number")) is not int:
-        raise ValueError(f"{where}: expected a frame with its number, got {str(record)[:60]}. The file is damaged.")
-    expected = {field.name for field in dataclasses.fields(Camera)}
-    for key in ("camera", "native_camera"):
-        camera = record.get(key)
-        if camera is not None and (not isinstance(camera, dict) or set(camera) != expected):
-            found = ", ".join(camera) if isinstance(camera, dict) else repr(camera)
+_FRAME_NUMBER = whole(-(2**31), 2**31)
+_CAMERA_SIZES = {"camera_to_world": 16, "focal": 2, "center": 2}
+_CAMERA = or_null(
+    Kind(
+        "camera_to_world (4x4 numbers), focal and center (2 numbers each)",
+        lambda value: (
+            isinstance(value, dict)
+            and set(value) == set(_CAMERA_SIZES)
+            and all(numbers(size).fits(value[key]) for key, size in _CAMERA_SIZES.items())
+        ),
+    )
+)
+_CHANNELS = Kind(
+    f"a list of images among {', '.join(SUFFIXES)}, each once",
+    lambda value: (
+        isinstance(value, list)
+        and all(isinstance(image, str) and image in SUFFIXES for image in value)
+        and len(set(value)) == len(value) > 0
+    ),
+)
+_SEQUENCE = {
+    "name": NAME, "width": whole(1, 1 << 16), "height": whole(1, 1 << 16), "scale": whole(1, 64), "native": FLAG,
+    "channels": _CHANNELS,
+    "ranges": FLAG, "source": OBJECT, "frames": LIST, "complete": FLAG, "skipped": LIST,
+}  # fmt: skip
+# Jitter outside of -0.5..0.5 is for ``check`` to explain.
+_FRAME = {
+    "number": _FRAME_NUMBER, "jitter": numbers(2, 1), "cut": FLAG, "exposure": or_null(POSITIVE), "camera": _CAMERA,
+    "notes": OBJECT, "made_from": TEXT,
+}  # fmt: skip
+_NATIVE = {"native_jitter": numbers(2, 1), "native_camera": _CAMERA}
+_SKIPPED = {"number": _FRAME_NUMBER, "reason": TEXT, "made_from": TEXT}
+_SEGMENT = {"sequence": NAME, "first": _FRAME_NUMBER, "last": _FRAME_NUMBER, "score_from": _FRAME_NUMBER}
+
+
+def _check_records(path: Path, content: Mapping[str, Any]) -> None:
+    """Check each frame that ``sequence.json`` lists, and their order."""
+    kinds = {**_FRAME, **(_NATIVE if content["native"] else {})}
+    before = None
+    for index, record in enumerate(content["frames"]):
+        where = f"{path}, record {index}"
+        check(where, record, {"number": _FRAME_NUMBER})
+        check(f"{where}, frame {record['number']}", record, kinds, optional=("notes", "made_from"))
+        if before is not None and record["number"] <= before:
             raise ValueError(
-                f"{where}, frame {record['number']}: {key}: expected {', '.join(sorted(expected))}, got {found}."
+                f"{where}: number: expected more than {before}, got {record['number']}: frames are in order."
             )
+        before = record["number"]
+    for index, record in enumerate(content["skipped"]):
+        check(f"{path}, skipped, record {index}", record, _SKIPPED, optional=("made_from",))
 
 
 def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
     """Read ``sequence.json`` of a sequence, finished or not.
 
     Raises:
-      ValueError: it is missing, damaged, of another schema, or lacks a field.
+      ValueError: it is missing, damaged, of another schema, or a field is missing or wrong; names file and key.
     """
+    if not is_name(name):  # it may come from a file: nothing outside of the dataset is read or written
+        raise ValueError(f"{root}: sequence name: expected {NAME.expected}, got {shown(name)}.")
     path = Path(root) / name / "sequence.json"
     content = _schema(path, read_json(path))
     content = {"ranges": False, "skipped": [], **content}  # datasets older than these
-    fields = [field.name for field in dataclasses.fields(SequenceInfo)]
-    missing = [field for field in fields if field not in content]
-    if missing:
-        raise ValueError(f"{path}: the fields {', '.join(missing)} are missing.")
-    for field in ("channels", "frames", "skipped"):
-        if not isinstance(content[field], list):
-            raise ValueError(f"{path}: {field}: expected a list, got {content[field]!r}.")
-        content[field] = tuple(content[field])
-    for index, record in enumerate((*content["frames"], *content["skipped"])):
-        _check_record(f"{path}, record {index}", record)
-    if len({record.get("exposure") is None for record in content["frames"]}) > 1:
-        raise ValueError(f"{path}: exposure: expected a number for all frames, or null for all; the file is damaged.")
-    return SequenceInfo(**{field: content[field] for field in fields})
+    check(str(path), content, _SEQUENCE)
+    if content["name"] != name:
+        raise ValueError(f"{path}: name: expected {name!r} as its folder, got {shown(content['name'])}.")
+    _check_records(path, content)
+    for key in (*OPEN, "native_camera"):
+        if len({record.get(key) is None for record in content["frames"]}) > 1:
+            raise ValueError(f"{path}: {key}: expected a value for all frames, or null for all; the file is damaged.")
+    fields = {key: tuple(value) if isinstance(value, list) else value for key, value in content.items()}
+    return SequenceInfo(**{field.name: fields[field.name] for field in dataclasses.fields(SequenceInfo)})
 
 
 def write_sequence_info(root: str | os.PathLike, info: SequenceInfo) -> None:
@@ -318,11 +341,16 @@ def read_index(root: str | os.PathLike) -> tuple[list[str], dict[str, Any], dict
     """
     file = Path(root) / "dataset.json"
     content = _schema(file, read_json(file))
-    try:
-        names, source, splits = list(content["sequences"]), dict(content["source"]), dict(content["splits"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: a field is missing or has the wrong form ({error!r}).") from error
-    return names, source, splits
+    check(str(file), content, {"sequences": LIST, "source": OBJECT, "splits": OBJECT})
+    names, splits = content["sequences"], content["splits"]
+    for index, name in enumerate(names):
+        if not is_name(name) or names.index(name) < index:
+            raise ValueError(f"{file}: sequences: expected plain folder names, each once, got {shown(name)}.")
+    for split, entries in splits.items():
+        check(f"{file}: splits", splits, {split: LIST})
+        for index, entry in enumerate(entries):
+            check(f"{file}: split {split}, segment {index}", entry, _SEGMENT)
+    return names, content["source"], splits
 
 
 def read_dataset(path: str | os.PathLike) -> Dataset:
@@ -339,10 +367,10 @@ def read_dataset(path: str | os.PathLike) -> Dataset:
             f"`essjax import SOURCE {root}` (an interrupted one resumes with the same command)."
         )
     names, source, splits = read_index(root)
-    try:
-        resolved = {split: tuple(Segment(**entry) for entry in entries) for split, entries in splits.items()}
-    except (TypeError, AttributeError) as error:
-        raise ValueError(f"{file}: a field is missing or has the wrong form ({error!r}).") from error
+    resolved = {
+        split: tuple(Segment(*(entry[field] for field in Segment._fields)) for entry in entries)
+        for split, entries in splits.items()
+    }
     sequences = {name: read_sequence_info(root, name) for name in names}
     if not sequences:
         raise ValueError(f"{file}: expected at least one sequence, got none.")

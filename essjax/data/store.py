@@ -12,7 +12,8 @@ import numpy as np
 import OpenEXR
 
 from essjax.data import encode
-from essjax.data.layout import AGREE, KINDS, SequenceInfo, frame_path, read_sequence_info, write_sequence_info
+from essjax.data.json_files import is_name
+from essjax.data.layout import AGREE, KINDS, OPEN, SequenceInfo, frame_path, read_sequence_info, write_sequence_info
 from essjax.data.records import differences, digest, frame_record, plain
 from essjax.frames import Sequence, select_time
 
@@ -62,7 +63,7 @@ class SequenceWriter:
           ValueError: the name is not a folder name, the sequence there was made from another source, or the images
             there are not of a sequence.
         """
-        if not name or name != Path(name).name or name.startswith("."):
+        if not is_name(name):
             raise ValueError(f"sequence name: expected a plain folder name, got {name!r}.")
         self.root, self.name, self.source = Path(root), name, plain(dict(source or {}))
         self.info: SequenceInfo | None = None
@@ -114,7 +115,7 @@ class SequenceWriter:
         """Whether the sequence is finished."""
         return self.info is not None and self.info.complete
 
-    def _check_next(self, number: int, described: SequenceInfo, cut: bool, exposure: Any) -> SequenceInfo:
+    def _check_next(self, number: int, described: SequenceInfo, cut: bool, said: Mapping[str, Any]) -> SequenceInfo:
         info = self.info or described
         for field in (*AGREE, "native"):
             if getattr(info, field) != getattr(described, field):
@@ -122,12 +123,13 @@ class SequenceWriter:
                     f"sequence {self.name}, frame {number}: {field} changes from {getattr(info, field)} to "
                     f"{getattr(described, field)}; {DISAGREES}."
                 )
-        if info.frames and (exposure is None) != (info.frames[0]["exposure"] is None):
-            there, here = ("has one", "has none") if exposure is None else ("has none", "has one")
-            raise ValueError(
-                f"sequence {self.name}, frame {number}: exposure: frame {info.numbers[0]} {there}, this one {here}; "
-                f"{DISAGREES}. Give it for all, or for none."
-            )
+        for key in OPEN if info.frames else ():
+            if (said[key] is None) != (info.frames[0][key] is None):
+                there, here = ("has one", "has none") if said[key] is None else ("has none", "has one")
+                raise ValueError(
+                    f"sequence {self.name}, frame {number}: {key}: frame {info.numbers[0]} {there}, this one {here}; "
+                    f"{DISAGREES}. Give it for all, or for none."
+                )
         if info.frames and number != info.numbers[-1] + 1 and not (cut and number > info.numbers[-1]):
             raise ValueError(
                 f"sequence {self.name}: expected frame {info.numbers[-1] + 1} next, got {number}. Motion links each "
@@ -153,7 +155,7 @@ class SequenceWriter:
         if self._is_there(number, made_from):
             return
         frame = content.frames
-        self._check_next(number, self.describe(number, content), bool(frame.cut), frame.exposure)
+        self._check_next(number, self.describe(number, content), bool(frame.cut), vars(frame))
         self.commit(self._write_images(number, content, notes or {}, {}, made_from))
 
     def _is_there(self, number: int, made_from: str) -> bool:
@@ -213,7 +215,7 @@ class SequenceWriter:
         """
         cut = cut or prepared.record["cut"]
         try:
-            info = self._check_next(prepared.number, prepared.described, cut, prepared.record["exposure"])
+            info = self._check_next(prepared.number, prepared.described, cut, prepared.record)
         except ValueError:
             self.discard(prepared.number)
             raise

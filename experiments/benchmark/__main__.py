@@ -80,7 +80,7 @@ def _benchmark(options: Command, console: Console) -> int:
     # Imported here: a typing error should not wait for JAX, and JAX reads its platform once.
     import jax
 
-    from essjax.data.layout import write_json
+    from essjax.data.json_files import write_json
     from experiments.benchmark import machine, schema, suites
     from experiments.benchmarks_page import RESULTS
     from experiments.environment import environment

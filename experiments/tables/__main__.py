@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _tables(options: TablesOptions, console: Console) -> int:
     # Imported here: a typing error in the command line should not wait for JAX.
-    from essjax.data.layout import write_json
+    from essjax.data.json_files import write_json
     from essjax.files import atomic
     from experiments import tables
 

@@ -265,7 +265,7 @@ def test_all_frames_of_a_sequence_have_an_exposure_or_none(tmp_path):
     content["frames"][1]["exposure"] = None
     path.write_text(json.dumps(content))
     with pytest.raises(
-        ValueError, match=r"a/sequence\.json: exposure: expected a number for all frames, or null for all"
+        ValueError, match=r"a/sequence\.json: exposure: expected a value for all frames, or null for all"
     ):
         write_dataset(tmp_path, {"train": ["a"]})
 
@@ -341,18 +341,18 @@ def test_damaged_metadata_is_named(dataset_on_disk):
     content = json.loads(sequence_json.read_text())
     del content["frames"][1]["jitter"]
     sequence_json.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"sequence\.json, frame 9: 'jitter' is missing"):
-        read_sequence(read_dataset(root), "a")
+    with pytest.raises(ValueError, match=r"sequence\.json, record 1, frame 9: the field jitter is missing"):
+        read_dataset(root)
     content["frames"][1]["jitter"] = [0.0, 0.0]
     content["frames"][2]["camera"]["fov"] = 1.0
     sequence_json.write_text(json.dumps(content))
     with pytest.raises(
-        ValueError, match=r"record 2, frame 10: camera: expected camera_to_world, center, focal, got .*fov"
+        ValueError, match=r"record 2, frame 10: camera: expected camera_to_world .*, focal and center .* or null, got {"
     ):
         read_dataset(root)
     del content["frames"][1]["number"]
     sequence_json.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"sequence\.json, record 1: expected a frame with its number, got {'"):
+    with pytest.raises(ValueError, match=r"sequence\.json, record 1: the field number is missing"):
         read_dataset(root)
     sequence_json.write_text(json.dumps({**content, "frames": 3}))
     with pytest.raises(ValueError, match=r"sequence\.json: frames: expected a list, got 3"):
@@ -370,7 +370,7 @@ def test_damaged_metadata_is_named(dataset_on_disk):
     with pytest.raises(ValueError, match=r"sequence\.json: not found"):
         read_dataset(root)
     dataset_json.write_text(json.dumps({"schema": 1, "sequences": ["a"], "source": {}}))
-    with pytest.raises(ValueError, match=r"dataset\.json: a field is missing or has the wrong form .*splits"):
+    with pytest.raises(ValueError, match=r"dataset\.json: the field splits is missing"):
         read_dataset(root)
     dataset_json.write_text("[]")
     with pytest.raises(ValueError, match="expected a JSON object, found a list"):

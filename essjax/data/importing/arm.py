@@ -12,7 +12,7 @@ import numpy as np
 
 from essjax.data.importing.facts import Facts, FrameFacts, lookup
 from essjax.data.importing.planes import stacked_facts
-from essjax.data.layout import read_json
+from essjax.data.json_files import FLAG, LIST, check, read_json, whole
 
 RATIO = re.compile(r"x(\d+(?:_\d+)?)_index")
 """``x2_index``, ``x1_5_index``: the upscaling ratio in the name of an index."""
@@ -44,6 +44,10 @@ def _jitter(record: Mapping[str, Any], index: int | None) -> np.ndarray:
     return np.asarray([jitter["X"], jitter["Y"]], np.float32)
 
 
+_FLAGS = ("ReverseZ", "MotionVectorsDilated", "CameraCut")
+"""Fields that may be absent: false."""
+
+
 def arm_facts(path: Path, width: int, height: int) -> Facts:
     """Jitter (fractions of the frame's size), exposure, cuts and planes of one capture, and whether motion is dilated.
 
@@ -58,11 +62,15 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
     content = read_json(path)
     if content.get("GTColorSpace", "Linear") != "Linear":
         raise ValueError(f"{path}: expected GTColorSpace Linear, got {content['GTColorSpace']!r}. Capture it again.")
-    try:
+    check(str(path), content, {"Frames": LIST, "ReverseZ": FLAG, "MotionVectorsDilated": FLAG}, optional=_FLAGS)
+    frames = {}
+    for position, record in enumerate(content["Frames"]):
         # The plugin for Unreal writes FrameNumber where the specification says Frame.
-        frames = {int(record.get("Frame", record.get("FrameNumber"))): record for record in content["Frames"]}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: expected Frames ({error!r}).") from error
+        key = "FrameNumber" if isinstance(record, dict) and "Frame" not in record else "Frame"
+        check(f"{path}: Frames, entry {position}", record, {key: whole(0, 1 << 31), "CameraCut": FLAG}, optional=_FLAGS)
+        if record[key] in frames:
+            raise ValueError(f"{path}: Frames, entry {position}: the frame {record[key]} is there twice.")
+        frames[record[key]] = record
     try:
         index = _ratio_index(path, content, width)
     except (KeyError, TypeError, AttributeError) as error:
@@ -81,7 +89,7 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
                 depth_kind="reversed" if content.get("ReverseZ", False) else "forward",
                 dilated=bool(content.get("MotionVectorsDilated", False)),
             )
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"{path}, frame {number}: a field is missing or has the wrong form ({error!r})."
             ) from error

@@ -17,10 +17,10 @@ import numpy as np
 
 from essjax.cameras import Camera, pixel_positions, unproject
 from essjax.data import exr
-from essjax.data.importing.facts import make_camera
+from essjax.data.importing.facts import make_camera, numbered
 from essjax.data.importing.motion import camera_motion
 from essjax.data.importing.stream import Converted
-from essjax.data.layout import read_json
+from essjax.data.json_files import OBJECT, POSITIVE, Kind, check, numbers, read_json, whole
 from essjax.frames import Frame, GBuffers
 
 BLENDER_BACKGROUND = 1e9
@@ -56,6 +56,14 @@ def _blender_camera(record: Mapping, width: int, height: int) -> Camera:
     return make_camera(record["camera_to_world"], [focal, focal], [width / 2, height / 2])
 
 
+_PIXELS = whole(1, 1 << 16)
+_SIZE = Kind(
+    "two whole numbers of pixels, above 0",
+    lambda value: isinstance(value, list) and len(value) == 2 and all(map(_PIXELS.fits, value)),
+)
+_FRAME = {"camera_to_world": numbers(16), "lens_mm": POSITIVE, "sensor_width_mm": POSITIVE, "jitter": numbers(2)}
+
+
 def _read_meta(folder: Path) -> _Dump:
     path = folder / "meta.json"
     if not path.is_file():
@@ -64,21 +72,15 @@ def _read_meta(folder: Path) -> _Dump:
             "per frame jitter, camera_to_world, lens_mm, sensor_width_mm), lr.NNNN.exr and hr.NNNN.exr."
         )
     meta = read_json(path)
-    try:
-        (width, height), (wide, high) = meta["render_size"], meta["display_size"]
-        cameras = {int(n): _blender_camera(record, width, height) for n, record in meta["frames"].items()}
-        jitters = {int(n): np.asarray(record["jitter"], np.float32) for n, record in meta["frames"].items()}
-    except KeyError as error:
-        raise ValueError(f"{path}: the field {error} is missing.") from error
-    except (TypeError, ValueError, AttributeError, ZeroDivisionError) as error:
-        raise ValueError(f"{path}: a field has the wrong form ({error}).") from error
+    check(str(path), meta, {"render_size": _SIZE, "display_size": _SIZE, "frames": OBJECT})
+    (width, height), (wide, high) = meta["render_size"], meta["display_size"]
+    frames = numbered(path, meta["frames"])
+    for number, record in frames.items():
+        check(f"{path}, frame {number}", record, _FRAME)
+    cameras = {number: _blender_camera(record, width, height) for number, record in frames.items()}
+    jitters = {number: np.asarray(record["jitter"], np.float32) for number, record in frames.items()}
     if not cameras:
         raise ValueError(f"{path}: expected at least one frame under 'frames', got none.")
-    if not all(isinstance(size, int) and size > 0 for size in (width, height, wide, high)):
-        raise ValueError(
-            f"{path}: expected render_size and display_size in whole pixels, above 0, got {[width, height]} and "
-            f"{[wide, high]}."
-        )
     if (wide, high) != (width * (wide // width), height * (wide // width)):
         raise ValueError(
             f"{path}: expected display_size to be a whole multiple of render_size, got {wide}x{high} and "

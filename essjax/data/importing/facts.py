@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.data.layout import read_json
+from essjax.data.json_files import FLAG, OBJECT, Kind, check, numbers, or_null, read_json, shown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +73,32 @@ def lookup(path: Path, frames: Mapping[int, Mapping], number: int) -> Mapping:
     return frames[number]
 
 
+def numbered(path: Path, records: Mapping[str, Any]) -> dict[int, Any]:
+    """Take the keys as frame numbers; a ValueError if one is none, or there twice ("8" and "08")."""
+    frames: dict[int, Any] = {}
+    for key, record in records.items():
+        number = int(key) if key.isdecimal() and len(key) < 10 else None
+        if number is None or number in frames:
+            raise ValueError(f"{path}: frames: expected numbers of frames, each once, got {shown(key)}.")
+        frames[number] = record
+    return frames
+
+
+def _is_numeral(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and not math.isnan(float(value))  # far may be infinite
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+_NUMERAL = or_null(Kind("a number", _is_numeral))
+"""Other programs write numbers as texts, too."""
+_CAMERA = {"camera_to_world": numbers(16), "focal": numbers(2), "center": numbers(2)}
+_FACTS = {
+    "jitter": numbers(2), "exposure": _NUMERAL, "cut": FLAG, "near": _NUMERAL, "far": _NUMERAL, **_CAMERA,
+}  # fmt: skip
+
+
 def generic_facts(path: Path, width: int, height: int) -> Facts:
     """Facts from ``{"frames": {"8": {"jitter": [x, y], "exposure": 1.0, "cut": false, ...}}}``.
 
@@ -80,23 +106,23 @@ def generic_facts(path: Path, width: int, height: int) -> Facts:
       ValueError: the file is missing or damaged.
     """
     content = read_json(path)
-    try:
-        frames = {int(number): dict(record) for number, record in content["frames"].items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: expected {{'frames': {{number: {{...}}}}}} ({error!r}).") from error
+    check(str(path), content, {"frames": OBJECT})
+    frames = numbered(path, content["frames"])
 
     def camera(number: int) -> Camera | None:
         record = frames.get(number, {})
         if "camera_to_world" not in record:
             return None
+        check(f"{path}, frame {number}", record, _CAMERA, optional=("center",))
         center = record.get("center", [width / 2, height / 2])
         return make_camera(record["camera_to_world"], record["focal"], center)
 
     def facts(number: int, header: Mapping[str, Any]) -> FrameFacts:
         record = lookup(path, frames, number)
+        check(f"{path}, frame {number}", record, _FACTS, optional=_FACTS)
         try:
             return FrameFacts(
-                jitter=None if "jitter" not in record else np.asarray(record["jitter"], np.float32).reshape(2),
+                jitter=None if "jitter" not in record else np.asarray(record["jitter"], np.float32),
                 exposure=None if record.get("exposure") is None else float(record["exposure"]),
                 cut=bool(record.get("cut", False)),
                 near=None if record.get("near") is None else float(record["near"]),

@@ -13,7 +13,7 @@ import numpy as np
 from essjax.data.exr import layer
 from essjax.data.importing.files import hidden
 from essjax.data.importing.planes import STACKS, channels_in, count_frames
-from essjax.data.layout import read_json
+from essjax.data.json_files import read_json
 
 ENDINGS = (".exr", ".png", ".npy", ".npz", ".safetensors")
 _WORD = r"(?<![a-z])({})(?![a-z])"

@@ -165,7 +165,7 @@ def _files(where: str, content: Any) -> dict[str, str]:
                 f"{where} {key}: expected a path with {{frame}} in it, got {pattern!r}. Only {', '.join(STACKS)} may "
                 "hold all frames."
             )
-        if PurePath(pattern).is_absolute() or not pattern:
+        if PurePath(pattern).is_absolute() or ".." in PurePath(pattern).parts or not pattern:
             raise ValueError(f"{where} {key}: expected a path below the dump's folder, got {pattern!r}.")
     if "frame" not in files and "color" not in files:
         raise ValueError(f"{where}: expected a pattern for frame (all images in one file) or for color.")
@@ -254,7 +254,7 @@ def _merge(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
+    except (OSError, ValueError, RecursionError) as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
         raise ValueError(f"{path}: expected a recipe in TOML, cannot read it ({error}).") from error
 
 

@@ -281,13 +281,11 @@ def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
         run()
     for size in ([0, 0], [20.5, 12], [-20, 12]):
         (dump / "meta.json").write_text(json.dumps({**meta, "render_size": size}))
-        with pytest.raises(
-            ValueError, match=r"meta\.json: expected render_size and display_size in whole pixels, above"
-        ):
+        with pytest.raises(ValueError, match=r"meta\.json: render_size: expected two whole numbers of pixels, above 0"):
             run()
     del meta["frames"]["9"]["lens_mm"]
     (dump / "meta.json").write_text(json.dumps(meta))
-    with pytest.raises(ValueError, match=r"meta\.json: the field 'lens_mm' is missing"):
+    with pytest.raises(ValueError, match=r"meta\.json, frame 9: the field lens_mm is missing"):
         run()
     (dump / "meta.json").write_text(json.dumps({**meta, "frames": {}}))
     with pytest.raises(ValueError, match=r"meta\.json: expected at least one frame"):

@@ -192,7 +192,7 @@ def test_planes_of_the_metadata(tmp_path):
     path.write_text(json.dumps({"frames": frames}))
     facts, rule = generic_facts(path, W, H), recipe(depth={"kind": "reversed"})
     np.testing.assert_array_equal(view_depth(plane(0.5), rule, facts(1, {}), NOWHERE), 0.5)
-    with pytest.raises(ValueError, match=r"shot\.json, frame 2: a field is missing or has the wrong form.*close"):
+    with pytest.raises(ValueError, match=r"shot\.json, frame 2: near: expected a number or null, got 'close'"):
         facts(2, {})
     for number, near, far in ((3, 2, "1"), (4, 0, "inf")):
         with pytest.raises(ValueError, match=rf"expected 0 < near < far of the planes, got near {near} and far {far}"):
