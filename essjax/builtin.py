@@ -22,9 +22,9 @@ from essjax.scenes import (
 from essjax.scenes.sequence import USUAL
 from essjax.stopping import finishing
 
-RENDERER = "essjax.scenes 3"
+RENDERER = "essjax.scenes 4"
 """How datasets of the built-in renderer name it; the number grows when the same seed gives another picture."""
-UNSAID = {"jitter": "halton", "ranges": False}
+UNSAID = {"jitter": "kronecker", "ranges": False}
 """Settings that a dataset names only if they differ from these: it may be older than the choice."""
 Progress = Callable[[int, int], Any]
 """Called with (frames done, frames in all)."""

@@ -100,7 +100,7 @@ def scenes(
     ranges: bool = False,
     seed: int = 0,
     mip_bias: float = 0.0,
-    jitter: Literal["halton", "dlctus"] = "halton",
+    jitter: Literal["kronecker", "dlctus"] = "kronecker",
 ) -> None:
     """Render built-in scenes into a dataset. Interrupted, the same command resumes; other splits can be added.
 
@@ -117,7 +117,7 @@ def scenes(
       ranges: Also the ranges over the reference's samples, which a classifier is trained on.
       seed: Skip this many seeds of the split.
       mip_bias: Texture filter, log2 of its width over an output pixel's.
-      jitter: Pattern of the sample positions: halton serves half the frames as well as all, dlctus only all of them.
+      jitter: Pattern of the sample positions: kronecker serves every rate, dlctus only all frames rendered.
     """
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None

@@ -34,15 +34,27 @@ def every() -> Schedule:
     return Schedule(lambda length: (SS,) * length, 1, 0)
 
 
-def alternate(parity: int = 0) -> Schedule:
-    """Every other frame is rendered: parity 0 renders 0, 2, 4 ..., parity 1 renders 0 (warm-up), 1, 3, 5 ..."""
-    if parity not in (0, 1):
-        raise ValueError(f"parity: expected 0 or 1, got {parity!r}.")
+def alternate(phase: int = 0, *, period: int = 2) -> Schedule:
+    """One frame in ``period`` is rendered: ``phase``, ``phase + period``, ... and frame 0, where any history begins.
+
+    Period 2, the papers' alternation: phase 0 renders 0, 2, 4 ..., phase 1 renders 0, 1, 3, 5 ...
+
+    Args:
+      phase: 0 ... period - 1.
+      period: at least 2; ``period - 1`` frames are extrapolated from each rendered one.
+
+    Raises:
+      ValueError: either is out of range.
+    """
+    if not (isinstance(period, int) and period >= 2):
+        raise ValueError(f"period: expected a whole number of at least 2, got {period!r}. Rendering all is every().")
+    if phase not in range(period):
+        raise ValueError(f"phase: expected 0 to {period - 1} (period {period}), got {phase!r}.")
 
     def kinds(length: int) -> tuple[str, ...]:
-        return tuple(SS if n == 0 or n % 2 == parity else ESS for n in range(length))
+        return tuple(SS if n == 0 or n % period == phase else ESS for n in range(length))
 
-    return Schedule(kinds, 2, parity)
+    return Schedule(kinds, period, phase)
 
 
 @pytree
@@ -98,7 +110,7 @@ def unroll(
       method: the two steps.
       variables: from ``method.init``.
       frames: the colour of extrapolated frames is removed before the method sees them.
-      schedule: ``every()`` or ``alternate(parity)``.
+      schedule: ``every()`` or ``alternate(phase, period=...)``.
       train: passed to the steps.
       keep: chooses from each prediction's ``aux`` what to stack in time; nothing by default.
       remat: recompute the steps in the backward pass instead of storing their intermediates.
@@ -110,8 +122,8 @@ def unroll(
     length = frames.motion.shape[0]
     kinds = schedule.kinds(length)
     check_supported(method, frames, kinds)
-    pairs = max((length - schedule.lead) // schedule.period, 0)
-    body_end = schedule.lead + pairs * schedule.period
+    periods = max((length - schedule.lead) // schedule.period, 0)
+    body_end = schedule.lead + periods * schedule.period
     history = method.start(select_time(frames, 0)) if history is None else history
 
     def run(history, frame, kind):
@@ -135,8 +147,8 @@ def unroll(
     )
     history, collected = run_all(history, lead, kinds[: schedule.lead])
     parts = [collected]
-    if pairs:
-        body = jax.tree.map(lambda leaf: leaf.reshape(pairs, schedule.period, *leaf.shape[1:]), body)
+    if periods:
+        body = jax.tree.map(lambda leaf: leaf.reshape(periods, schedule.period, *leaf.shape[1:]), body)
         body_kinds = kinds[schedule.lead : schedule.lead + schedule.period]
         if train and method.parts is not None:
             history, collected = _scan_parts(method.parts, variables, history, body, body_kinds, keep, remat)

@@ -1,5 +1,6 @@
 """Train steps are compiled while the data renders: their shapes are known before the first frame is."""
 
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
@@ -11,17 +12,20 @@ from essjax.typing import Array
 from experiments.datasets import rendering_of
 from experiments.members import Member
 from experiments.settings import Settings
-from experiments.training import check_crop, clip_length, initial_state, make_step
+from experiments.training import batch_lead, check_crop, initial_state, make_steps
 from experiments.variants import Stage
 
 
-def batch_shapes(settings: Settings, stage: Stage) -> Sequence:
-    """Return what ``make_batches`` gives on the built-in scenes, as shapes; one small frame is rendered."""
+def batch_shapes(settings: Settings, stage: Stage) -> dict[str, Sequence]:
+    """Return what ``make_batches`` gives of each task on the built-in scenes, as shapes; a small frame is rendered."""
     width, height = check_crop(stage.settings, *settings.data.size, settings.data.scale)
     clip = Clip("train", "carousel", 0, frames=1, spp=1)
     one = live_source([clip], width, height, rendering=rendering_of(settings, ranges=stage.ranges))[0]
-    lead = clip_length(stage, settings.data.train_frames), stage.settings.batch
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), leaf.dtype), one)
+    leads = {name: batch_lead(stage, task, settings.data.train_frames) for name, task in stage.tasks.items()}
+    return {
+        name: jax.tree.map(lambda leaf, lead=lead: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), leaf.dtype), one)
+        for name, lead in leads.items()
+    }
 
 
 class Ahead:
@@ -30,9 +34,16 @@ class Ahead:
     def __init__(self, member: Member):
         """Start at once."""
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="essjax-ahead")
-        futures = {stage.name: self._worker.submit(_compile, member, stage) for stage in member.stages}
-        self.steps = {name: _Awaited(list(futures.values()), step) for name, step in futures.items()}
-        """Stage -> its step, for ``train``."""
+        futures = {
+            stage.name: {task: self._worker.submit(_compile, member, stage, task) for task in stage.tasks}
+            for stage in member.stages
+        }
+        everything = [step for steps in futures.values() for step in steps.values()]
+        self.steps = {
+            stage: {task: _Awaited(everything, step) for task, step in steps.items()}
+            for stage, steps in futures.items()
+        }
+        """Stage -> task -> its step, for ``train``."""
 
     def close(self) -> None:
         """Begin no further one; the one in the making cannot be stopped."""
@@ -54,16 +65,17 @@ class _Awaited:
         return self._step.result()
 
 
-def state_shapes(member: Member, stage: Stage, batch: Sequence) -> TrainState:
+def state_shapes(member: Member, stage: Stage, batches: Mapping[str, Sequence]) -> TrainState:
     """Return the state that ``train_member`` starts ``stage`` with, as ``jax.ShapeDtypeStruct``s."""
 
-    def make(key: Array, batch: Sequence) -> TrainState:
-        variables = member.stages[-1].method.init(key, select_time(batch.frames, 0))
-        return initial_state(member, stage, variables, batch)
+    def make(key: Array, batches: Mapping[str, Sequence]) -> TrainState:
+        example = select_time(next(iter(batches.values())).frames, 0)
+        return initial_state(member, stage, member.stages[-1].method.init(key, example), batches)
 
-    return jax.eval_shape(make, jax.random.key(0), batch)
+    return jax.eval_shape(make, jax.random.key(0), dict(batches))
 
 
-def _compile(member: Member, stage: Stage):
-    batch = batch_shapes(member.settings, stage)
-    return make_step(stage, member.settings).lower(state_shapes(member, stage, batch), batch, 0.0).compile()
+def _compile(member: Member, stage: Stage, task: str):
+    batches = batch_shapes(member.settings, stage)
+    step = make_steps(stage, member.settings)[task]
+    return step.lower(state_shapes(member, stage, batches), batches[task], 0.0).compile()

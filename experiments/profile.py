@@ -14,7 +14,7 @@ from experiments.datasets import rendering_of
 from experiments.members import resolve, settings_of
 from experiments.settings import with_data
 from experiments.trace import describe, operations
-from experiments.training import initial_state, initial_variables, make_batches, make_step
+from experiments.training import first_batches, initial_state, initial_variables, make_steps
 
 
 def write_profile(
@@ -31,8 +31,10 @@ def write_profile(
     if stages:
         stage = stages[-1]
         variables = initial_variables(member, dataset)
-        step, batch = make_step(stage, settings), next(make_batches(dataset, settings, stage))
-        state = initial_state(member, stage, variables, batch)
+        batches = first_batches(dataset, settings, stage)
+        task = next(iter(batches))
+        step, batch = make_steps(stage, settings)[task], batches[task]
+        state = initial_state(member, stage, variables, batches)
         state, _ = step(state, batch, stage.settings.learning_rate)
         method, frames = stage.method, jax.tree.map(lambda leaf: leaf[:, :1], batch.frames)
         variables = state.variables

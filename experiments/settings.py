@@ -39,7 +39,7 @@ class Data:
     train_spp: int
     test_spp: int
     mip_bias: float
-    jitter: Literal["halton", "dlctus"]
+    jitter: Literal["kronecker", "dlctus"]
     fresh: int | None
 
 
@@ -47,12 +47,14 @@ class Data:
 class Training:
     """Settings that all stages share.
 
-    optimizer: of ``essjax.train.OPTIMIZERS``. anneal: the learning rates decay. save_every: seconds between
+    rates: one frame in so many is rendered, [2] as in the papers; of several, batches of each take turns. optimizer: of
+    ``essjax.train.OPTIMIZERS``. anneal: the learning rates decay. save_every: seconds between
     checkpoints. average: decay of a moving average of the weights over the steps; None: the last weights. validations:
     how often after the start of each stage, equally apart in its budget, the averaged weights play a few frames of each
     validation clip: the best are kept; None: never, the last are. vgg: path of VGG-16 weights.
     """
 
+    rates: tuple[int, ...]
     optimizer: Literal["muon", "adam"]
     anneal: bool
     save_every: float
@@ -63,10 +65,13 @@ class Training:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """tune: search the TAA family's settings on validation frames, else their defaults. warmup: frames that are not
-    scored at the start and after a cut. pictures: chosen frames per sequence.
+    """rates: one frame in so many is rendered, [2] as in the papers; the first one's results are the table, of several
+    or of more than 2 there is a second table by distance to the rendered frame. tune: search the TAA family's settings
+    on validation frames, else their defaults. warmup: frames that are not scored at the start and after a cut.
+    pictures: chosen frames per sequence.
     """
 
+    rates: tuple[int, ...]
     tune: bool
     warmup: int
     pictures: int
@@ -126,14 +131,16 @@ COMMON: Table = {
     "data.train_spp":            (4,        8,        64),
     "data.test_spp":             (8,        32,       64),
     "data.mip_bias":             (0.0,      0.0,      0.0),
-    "data.jitter":               ("halton", "halton", "halton"),
+    "data.jitter":               ("kronecker",) * 3,
     "data.fresh":                (None,     None,     None),
+    "training.rates":            ((2,),     (2,),     (2,)),
     "training.optimizer":        ("muon",   "muon",   "adam"),
     "training.anneal":           (True,     True,     True),
     "training.save_every":       (30.0,     30.0,     300.0),
     "training.average":          (0.99,     0.99,     0.999),
     "training.validations":      (2,        5,        100),
     "training.vgg":              (None,     None,     None),
+    "evaluation.rates":          ((2,),     (2,),     (2,)),
     "evaluation.tune":           (False,    True,     True),
     "evaluation.warmup":         (2,        5,        5),
     "evaluation.pictures":       (1,        1,        2),
@@ -231,9 +238,10 @@ def _below(level: str, known: Collection[str]) -> list[str]:
 def arguments(function: Callable) -> type:
     """Make a frozen dataclass of those arguments of ``function`` that are settings: plain values with a default.
 
-    What a ``functools.partial`` has settled is none, nor is ``scale``, which is ``data.scale``.
+    What a ``functools.partial`` has settled is none, nor are ``scale``, which is ``data.scale``, and ``period``, of
+    which ``training.rates`` says which ones are trained.
     """
-    settled = {"scale", *(function.keywords if isinstance(function, functools.partial) else ())}
+    settled = {"scale", "period", *(function.keywords if isinstance(function, functools.partial) else ())}
     found = [
         (parameter.name, parameter.annotation, parameter.default)
         for parameter in inspect.signature(function).parameters.values()
@@ -325,6 +333,7 @@ def _check_number(path: str, number: float, *, is_int: bool) -> None:
 
 _BOUNDS = {
     "seed": (0, math.inf), "train_frames": (2, math.inf), "test_frames": (2, math.inf), "clip": (2, math.inf),
-    "mip_bias": (-math.inf, math.inf), "average": (0, 1), "warmup": (0, math.inf), "pictures": (0, math.inf),
+    "rates": (2, 9), "mip_bias": (-math.inf, math.inf), "average": (0, 1), "warmup": (0, math.inf),
+    "pictures": (0, math.inf),
 }  # fmt: skip
 """Bounds other than 1 (integers) or 0 (others) and infinity: the least value, and what it is below."""

@@ -2,17 +2,19 @@
 
 import contextlib
 import functools
+import itertools
 import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import grain
 import jax
 import numpy as np
 
 from essjax.builtin import RENDERER, live_source
-from essjax.data import CachedSource, Rounds, clips, disk_source, successive_clips
+from essjax.data import CachedSource, Mixed, Rounds, Source, clips, disk_source, successive_clips
 from essjax.data.layout import Dataset
 from essjax.frames import Sequence, select_time
 from essjax.train import (
@@ -23,6 +25,7 @@ from essjax.train import (
     Validation,
     chosen_variables,
     create_state,
+    fitting_length,
     learning_rate,
     make_train_step,
     read_progress,
@@ -34,7 +37,7 @@ from experiments.datasets import rendering_of, train_clips
 from experiments.members import Member
 from experiments.settings import Settings, StageSettings, with_data
 from experiments.validation import Scorer
-from experiments.variants import Stage
+from experiments.variants import Stage, Task
 
 MIN_CROP = 24
 
@@ -80,29 +83,43 @@ def check_batches(dataset: Dataset, settings: Settings, stage: Stage) -> None:
             "are no new scenes of it. Leave fresh away, or train on the built-in scenes (no --data)."
         )
     source = disk_source(dataset, "train", ranges=stage.ranges, memory=0)
-    cutter(stage)(source, **_cut(dataset, stage))
+    for task in stage.tasks.values():
+        _clips(source, dataset, stage, task)
 
 
-def cutter(stage: Stage) -> Callable:
-    """Choose what cuts a stage's clips: those of a recurrent objective follow each other."""
-    return successive_clips if isinstance(stage.objective, Recurrent) else clips
+def batch_lead(stage: Stage, task: Task, longest: int) -> tuple[int, int]:
+    """Frames per clip and clips per batch, of sequences with ``longest`` frames at most.
+
+    The settings are for rate 1:2. At 1:k a clip has as many periods, rounded up, and where it is unrolled in every
+    phase a batch has fewer clips, so that the number of runs stays about the same.
+
+    Raises:
+      ValueError: no sequence is long enough.
+    """
+    clip, batch, period = stage.settings.clip, stage.settings.batch, task.period
+    if not task.recurrent:
+        return min(-(-clip * period // 2), longest), batch
+    wanted = -(-(clip - 1) // 2) * period + period - 1
+    length = fitting_length(min(wanted, longest), period)
+    if not length:
+        raise ValueError(
+            f"training.rates: expected sequences of at least {2 * period - 1} frames to train 1:{period}, got "
+            f"{longest} frames at most. Use longer ones, or leave that rate out."
+        )
+    return length, max(round(2 * batch / period), 1)
 
 
-def clip_length(stage: Stage, longest: int) -> int:
-    """Frames per clip, of sequences with ``longest`` frames at most; odd where clips follow each other."""
-    length = min(stage.settings.clip, longest)
-    return length - 1 + length % 2 if isinstance(stage.objective, Recurrent) else length
-
-
-def _cut(dataset: Dataset, stage: Stage) -> dict[str, Any]:
-    """How clips are cut, for ``cutter``."""
+def _clips(source: Source, dataset: Dataset, stage: Stage, task: Task, **options: Any) -> grain.IterDataset:
+    """Cut clips for a task out of ``source``; those of a recurrent objective follow each other."""
     width, height = check_crop(stage.settings, dataset.info.width, dataset.info.height, dataset.info.scale)
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
-    return {"length": clip_length(stage, longest), "batch": stage.settings.batch, "crop": (height, width)}
+    length, batch = batch_lead(stage, task, longest)
+    options |= {"length": length, "batch": batch, "crop": (height, width)}
+    return successive_clips(source, overlap=task.period - 1, **options) if task.recurrent else clips(source, **options)
 
 
 def make_batches(dataset: Dataset, settings: Settings, stage: Stage, *, prefetch: int = 4):
-    """Iterate over clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
+    """Iterate over tasks and clips ``[T, B, ...]`` for a stage: crops that fit the frames, as long as sequences allow.
 
     With ``data.fresh`` the scenes on disk are the first round, and each further one is rendered while the last is
     trained on. ``prefetch`` batches are held ready.
@@ -111,11 +128,12 @@ def make_batches(dataset: Dataset, settings: Settings, stage: Stage, *, prefetch
       ValueError: see ``check_batches``.
     """
     check_batches(dataset, settings, stage)
-    cut = {**_cut(dataset, stage), "prefetch": prefetch}
 
-    def make(number: int):
+    def make(number: int) -> Mixed:
         source = disk_source(dataset, "train", ranges=stage.ranges) if number == 0 else fresh(number)
-        return iter(cutter(stage)(source, **cut, seed=settings.seed + number))
+        options = {"seed": settings.seed + number, "prefetch": prefetch}
+        parts = {name: iter(_clips(source, dataset, stage, task, **options)) for name, task in stage.tasks.items()}
+        return Mixed(parts, seed=settings.seed + number)
 
     def fresh(number: int) -> CachedSource:
         rendering, clips = rendering_of(settings, ranges=stage.ranges), train_clips(settings, number)
@@ -127,35 +145,45 @@ def make_batches(dataset: Dataset, settings: Settings, stage: Stage, *, prefetch
 def initial_variables(member: Member, dataset: Dataset) -> PyTree:
     """Fresh variables of the last stage's method, which holds those of the stages before it."""
     last = member.stages[-1]
-    example = jax.tree.map(np.asarray, select_time(first_batch(dataset, member.settings, last).frames, 0))
+    batch = next(iter(first_batches(dataset, member.settings, last).values()))
+    example = jax.tree.map(np.asarray, select_time(batch.frames, 0))
     return last.method.init(jax.random.key(member.settings.seed), example)
 
 
-def first_batch(dataset: Dataset, settings: Settings, stage: Stage) -> Sequence:
-    """Return the first one that ``make_batches`` gives."""
+def first_batches(dataset: Dataset, settings: Settings, stage: Stage) -> dict[str, Sequence]:
+    """Return the first one of each task that ``make_batches`` gives."""
     # Without fresh scenes: the next round would be rendered for nothing.
-    return next(make_batches(dataset, with_data(settings, fresh=None), stage, prefetch=1))
+    batches = make_batches(dataset, with_data(settings, fresh=None), stage, prefetch=1)
+    return dict(itertools.islice(batches, len(stage.tasks)))
 
 
-def initial_state(member: Member, stage: Stage, variables: PyTree, batch: Sequence) -> TrainState:
-    """Make what ``stage`` starts with: variables of its own and of the stages before it; a history where clips follow.
+def initial_state(member: Member, stage: Stage, variables: PyTree, batches: Mapping[str, Sequence]) -> TrainState:
+    """Make what ``stage`` starts with: variables of its own and of the stages before it; histories where clips follow.
 
     Later stages' variables are not touched (nor saved) by it.
     """
     names = [each.name for each in member.stages]
     needed = {name: variables[name] for name in names[: names.index(stage.name) + 1]}
-    history = stage.objective.start(batch) if isinstance(stage.objective, Recurrent) else None
+    history = {
+        name: task.objective.start(batches[name])
+        for name, task in stage.tasks.items()
+        if isinstance(task.objective, Recurrent)
+    }
     training = member.settings.training
     optimizer, average = OPTIMIZERS[training.optimizer](), training.average is not None
     return create_state(needed, stage.name, optimizer, history=history, average=average)
 
 
-def make_step(stage: Stage, settings: Settings) -> Callable:
-    """Make the jitted step of a stage."""
+def make_steps(stage: Stage, settings: Settings) -> dict[str, Callable]:
+    """Make the jitted steps of a stage, one for each task."""
     training, options = settings.training, {"compiler_options": settings.compiler_options}
     if training.average is not None:
         options["average"] = training.average
-    return make_train_step(stage.objective, OPTIMIZERS[training.optimizer](), stage.name, **options)
+    optimizer = OPTIMIZERS[training.optimizer]()
+    return {
+        name: make_train_step(task.objective, optimizer, stage.name, task=name, **options)
+        for name, task in stage.tasks.items()
+    }
 
 
 def train_member(
@@ -168,21 +196,21 @@ def train_member(
       dataset: with a split to train on.
       variables: the initial ones.
       watcher: told what happens.
-      steps: stage -> its step, where it is being compiled already (``Ahead.steps``).
+      steps: stage -> its steps, where they are being compiled already (``Ahead.steps``).
 
     Returns:
       The variables, and stage -> what ``train`` says of it.
     """
     report, settings = {}, member.settings
     for stage in member.stages:
-        state = initial_state(member, stage, variables, first_batch(dataset, settings, stage))
+        state = initial_state(member, stage, variables, first_batches(dataset, settings, stage))
         validation = None
         if settings.training.validations is not None:
             validation = Validation(Scorer(stage.method, dataset, settings), settings.training.validations)
         checkpoints = Checkpoints(member.folder / "checkpoints" / stage.name)
         try:
             kept, report[stage.name] = train(
-                (steps or {}).get(stage.name) or make_step(stage, settings),
+                (steps or {}).get(stage.name) or make_steps(stage, settings),
                 state,
                 make_batches(dataset, settings, stage),
                 checkpoints,
@@ -225,7 +253,7 @@ def restore_member(member: Member, dataset: Dataset, variables: PyTree) -> tuple
             )
         checkpoints = Checkpoints(folder)
         try:
-            state = initial_state(member, stage, variables, first_batch(dataset, member.settings, stage))
+            state = initial_state(member, stage, variables, first_batches(dataset, member.settings, stage))
             state, best, saved = restore_stage(checkpoints, state, stage.name)
         finally:
             checkpoints.close()

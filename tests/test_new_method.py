@@ -10,7 +10,7 @@ import pytest
 from essjax.methods import registry
 from essjax.rollout import SS
 from experiments.members import resolve, settings_of
-from experiments.training import initial_state, make_step
+from experiments.training import initial_state, make_steps
 from experiments.variants import VARIANTS
 from tests.helpers import make_sequence, streamed
 
@@ -33,8 +33,8 @@ def test_the_method_of_the_guide_trains_and_streams(code):
     (stage,) = member.stages
     clip = make_sequence(0, T=3, B=1, H=6, W=9)
     variables = member.method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
-    state, losses = initial_state(member, stage, variables, clip), []
-    step = make_step(stage, settings)
+    (step,) = make_steps(stage, settings).values()
+    state, losses = initial_state(member, stage, variables, dict.fromkeys(stage.tasks, clip)), []
     for _ in range(stage.settings.steps):
         state, terms = step(state, clip, stage.settings.learning_rate)
         losses.append(float(terms["loss"]))

@@ -46,7 +46,7 @@ def toy(latency: int = 0, **info) -> Method:
 VARIABLES = {"mix": jnp.array(0.25)}
 TOY = toy()
 STEPS = {SS: jax.jit(TOY.render_step), ESS: jax.jit(TOY.extrapolate_step)}
-EVERY, EVEN, ODD = every(), alternate(0), alternate(1)
+EVERY, EVEN, ODD, FOURTH = every(), alternate(0), alternate(1), alternate(2, period=4)
 
 
 @functools.cache
@@ -69,14 +69,20 @@ def test_kinds():
     assert alternate(0).kinds(5) == (SS, ESS, SS, ESS, SS)
     assert alternate(1).kinds(6) == (SS, SS, ESS, SS, ESS, SS)
     assert indices_of(alternate(1).kinds(6), ESS) == [2, 4]
-    both = [set(indices_of(alternate(parity).kinds(9), ESS)) for parity in (0, 1)]
+    both = [set(indices_of(alternate(phase).kinds(9), ESS)) for phase in (0, 1)]
     assert both[0] | both[1] == set(range(1, 9)) and not both[0] & both[1]  # every frame but 0 is extrapolated once
-    with pytest.raises(ValueError, match="parity: expected 0 or 1, got 2"):
+    assert alternate(period=3).kinds(5) == (SS, ESS, ESS, SS, ESS)
+    assert alternate(2, period=3).kinds(7) == (SS, ESS, SS, ESS, ESS, SS, ESS)
+    rendered = [set(indices_of(alternate(phase, period=4).kinds(13), SS)) - {0} for phase in range(4)]
+    assert sorted(n for each in rendered for n in each) == list(range(1, 13))  # every frame but 0 is rendered once
+    with pytest.raises(ValueError, match=r"phase: expected 0 to 1 \(period 2\), got 2"):
         alternate(2)
+    with pytest.raises(ValueError, match="period: expected a whole number of at least 2, got 1"):
+        alternate(period=1)
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 6])
-@pytest.mark.parametrize("schedule", [EVERY, EVEN, ODD], ids=["every", "even", "odd"])
+@pytest.mark.parametrize("schedule", [EVERY, EVEN, ODD, FOURTH], ids=["every", "even", "odd", "fourth"])
 def test_unroll_equals_a_python_loop(schedule, length):
     frames = make_frames(length, T=length, H=4, W=5)
     frames = dataclasses.replace(frames, cut=frames.cut.at[min(3, length - 1), 1].set(True))

@@ -87,6 +87,7 @@ def successive_clips(
     *,
     length: int,
     batch: int,
+    overlap: int = 1,
     crop: tuple[int, int] | None = None,
     flips: bool = True,
     seed: int = 0,
@@ -96,14 +97,16 @@ def successive_clips(
     """Batches of clips without end, for training that carries its history from one to the next (``train.Recurrent``).
 
     As ``clips``, but clip b of a batch follows clip b of the batch before: the same sequence, crop and flips, and its
-    first frame is the last one of that clip, so that both parities go on without a gap. Where a shot ends, the slot
-    begins another one: that clip's frame 0 is a cut. Each slot sees all shots before any of them again; the frames left
-    over at the end of a shot are spread by chance over its beginning and its end.
+    first frames are the last ones of that clip, so that runs of every phase go on without a gap. Where a shot ends,
+    the slot begins another one: that clip's frame 0 is a cut. Each slot sees all shots before any of them again; the
+    frames left over at the end of a shot are spread by chance over its beginning and its end.
 
     Args:
       source: see ``clips``.
-      length: frames per clip, at least 2. A shot of n frames gives (n - 1) // (length - 1) clips in a row.
+      length: frames per clip, more than ``overlap``. A shot of n frames gives (n - overlap) // (length - overlap) clips
+        in a row.
       batch: see ``clips``.
+      overlap: frames that a clip shares with the next one: the period - 1 where one frame in a period is rendered.
       crop: see ``clips``; drawn for each shot.
       flips: see ``clips``; drawn for each shot.
       seed: see ``clips``.
@@ -113,15 +116,17 @@ def successive_clips(
     Raises:
       ValueError: see ``clips``.
     """
-    if length < 2 or batch < 1:
-        raise ValueError(f"successive clips: expected length >= 2 and batch >= 1, got {length} and {batch}.")
+    if length <= overlap or batch < 1:
+        raise ValueError(
+            f"successive clips: expected length > {overlap} (the overlap) and batch >= 1, got {length} and {batch}."
+        )
     shots = _shots(source, length)
     check_alike(source, crop)
 
     def draw(sequence: int, random: np.random.Generator) -> View:
         return draw_view(source, sequence, crop, flips, random)
 
-    step = length - 1
+    step = length - overlap
     slots = [_Slot(shots, draw, step, length, np.random.default_rng([seed, slot])) for slot in range(batch)]
 
     def make(number: int) -> Sequence:

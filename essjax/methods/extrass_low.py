@@ -72,18 +72,19 @@ def _enlarge(image: Image, like: Image) -> Image:
     return crop(nearest_upsample(image), *like.shape[-3:-1])
 
 
-def refine(network: Network, variables: PyTree, warped: Color, gbuffers: GBuffers) -> dict:
+def refine(network: Network, variables: PyTree, warped: Color, gbuffers: GBuffers, ages: Array) -> dict:
     """Shading refinement (eq 4-6): returns ``image`` (the blend of eq 5), FRNet's half-size output and the mask.
 
     Args:
       network: FRNet.
       variables: its variables.
-      warped: f_g(i_{t-1}) and f_g(i_{t-3}), linear, ``[2, ..., H, W, 3]``.
+      warped: the two latest rendered frames, warped by f_g, linear, ``[2, ..., H, W, 3]``.
       gbuffers: the current ones; roughness counts as 1 where absent.
+      ages: how many frames ago the two were rendered, ``[2, ...]``.
     """
     roughness = jnp.ones_like(gbuffers.depth) if gbuffers.roughness is None else gbuffers.roughness
     small = log1p(halve(warped))
-    output, _ = network.apply(variables, small, halve(roughness))
+    output, _ = network.apply(variables, small, halve(roughness), ages)
     refined, warped = backward_warp(small[0], output["flow"]), warped[0]
     mask = jax.lax.stop_gradient(blend_mask(expm1(refined), warped, gbuffers))
     # Not the half-size colour itself but how FRNet changed it: the detail of the full-size warp stays.
@@ -147,14 +148,14 @@ def extrapolate(
     """
     # Rendered frames carry no parameters: without stop_gradient the warps' backward pass would be computed for nothing.
     warped = jax.lax.stop_gradient(guided_extrapolation(pair, count, frame, **sigmas))
-    refined = refine(network, variables, warped, frame.gbuffers)
+    refined = refine(network, variables, warped, frame.gbuffers, pair.age)
     return Extrapolated(warp=warped[0], **refined)
 
 
-def frnet_inputs(example: Frame) -> tuple[Image, Image]:
+def frnet_inputs(example: Frame) -> tuple[Image, Image, Array]:
     """Zeros of the shapes that FRNet is applied to, for its ``init``."""
     half = halve(jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
-    return jnp.stack([half, half]), half[..., :1]
+    return jnp.stack([half, half]), half[..., :1], jnp.zeros((2, *half.shape[:-3]))
 
 
 @registered

@@ -29,6 +29,7 @@ class Rendered:
       motion: ``[K, ..., H, W, 2]`` composed motion from the latest frame's samples to that frame, unjittered.
       valid: ``[K, ..., H, W, 1]``: 1 where that path stays on screen.
       trust: ``[K, ..., H, W, 1]``: what the reactive masks along that path leave of it; None without such masks.
+      age: ``[K, ...]`` float32: how many frames ago it was rendered; 1 and 3 where every other frame is.
     """
 
     content: PyTree
@@ -36,6 +37,7 @@ class Rendered:
     motion: Motion
     valid: Mask
     trust: Mask | None
+    age: Array
 
 
 @pytree
@@ -43,7 +45,7 @@ class Memory:
     """The K latest rendered frames.
 
     Attributes:
-      frames: stacked: t-1, t-3, ... in the alternation; places that no frame has taken yet hold the oldest one.
+      frames: stacked: t-1, t-3, ... at half rate; places that no frame has taken yet hold the oldest one.
       count: ``[...]`` number rendered since the last cut.
       jitter: ``[..., 2]`` of the latest frame, rendered or not.
     """
@@ -76,6 +78,7 @@ def _remember(frame: Frame, content: PyTree) -> Rendered:
         motion=jnp.zeros_like(frame.motion),
         valid=jnp.ones_like(frame.gbuffers.depth),
         trust=None if frame.reactive is None else jnp.ones_like(frame.reactive),
+        age=jnp.zeros(frame.cut.shape, jnp.float32),
     )
 
 
@@ -107,7 +110,7 @@ def advance(memory: Memory, frame: Frame) -> Memory:
     )
     reactive = None if frame.reactive is None else share(frame.reactive)
     trust = path_trust(previous.trust, reactive, share(jittered_motion(frame.motion, frame.jitter, memory.jitter)))
-    frames = dataclasses.replace(previous, motion=motion, valid=valid, trust=trust)
+    frames = dataclasses.replace(previous, motion=motion, valid=valid, trust=trust, age=previous.age + 1.0)
     return dataclasses.replace(memory, frames=frames, jitter=frame.jitter)
 
 

@@ -13,8 +13,11 @@ def halton(index: int, base: int) -> float:
     return result
 
 
-PATTERNS = ("halton", "dlctus")
+PATTERNS = ("kronecker", "dlctus")
 """Names of the jitter patterns: see ``jitter_sequence``."""
+KRONECKER_STEP = (0.829019, 0.600993)
+"""From each frame to the next, modulo a pixel, (x, y). Of 30,000 steps the one whose multiples by 1, 2, 3 and 4 cover
+the pixel most evenly, 4 to 128 frames long (docs/adr/0016-rates.md)."""
 HIGH_RESOLUTION_ORDER = (
     (0, 0), (1, 2), (3, 2), (2, 0), (0, 1), (0, 3), (2, 2), (3, 0),
     (1, 0), (0, 2), (2, 3), (3, 1), (1, 1), (1, 3), (3, 3), (2, 1),
@@ -47,27 +50,22 @@ def dlctus_pattern(scale: int) -> np.ndarray:
         inside = [(halton(element, 2), halton(element, 3)) for element in range(2, 6)]
         positions = (np.asarray(inside)[:, None] + np.asarray(HOURGLASS)).reshape(16, 2) / 2
     else:
-        raise ValueError(f"jitter: the pattern dlctus exists for the scales 2 and 4, got {scale}. Use halton.")
+        raise ValueError(f"jitter: the pattern dlctus exists for the scales 2 and 4, got {scale}. Use kronecker.")
     return (positions - 0.5).astype(np.float32)
 
 
-def jitter_sequence(
-    length: int, *, pattern: str = "halton", scale: int = 2, period: int = 16, every_frame: bool = False
-) -> np.ndarray:
+def jitter_sequence(length: int, *, pattern: str = "kronecker", scale: int = 2) -> np.ndarray:
     """Jitter of each frame, pixels in [-0.5, 0.5).
 
-    "halton" is Halton (2, 3): frame n takes element n // 2, and odd frames are half a pixel further in both directions,
-    modulo a pixel. So even frames alone, odd frames alone and all together cover the pixel, for methods that render
-    every other frame and methods that render all (docs/adr/0010-jitter-for-both.md); plain Halton by n puts even and
-    odd n into opposite halves. "dlctus" is ``dlctus_pattern``, indexed by n: for methods that get every frame rendered.
-    Half the frames alone see half of it.
+    "kronecker": n times ``KRONECKER_STEP``, modulo a pixel; it does not repeat. Every frame, every second, every third
+    and every fourth cover the pixel alike, from whichever they begin, for methods that render one frame of so many.
+    "dlctus" is ``dlctus_pattern``, indexed by n: for methods that get every frame rendered. Half the frames alone see
+    half of it.
 
     Args:
       length: number of frames.
-      pattern: "halton" or "dlctus".
+      pattern: "kronecker" or "dlctus".
       scale: output size over input size, for "dlctus".
-      period: elements before Halton repeats.
-      every_frame: index Halton by n instead: for renderers that show colour of every frame (native TAA).
 
     Returns:
       ``[length, 2]`` float32, (x, y).
@@ -79,10 +77,7 @@ def jitter_sequence(
         raise ValueError(f"jitter: expected one of {', '.join(PATTERNS)}, got {pattern!r}.")
     if pattern == "dlctus":
         return dlctus_pattern(scale)[np.arange(length) % 16].reshape(length, 2)
-    steps = range(length) if every_frame else [n // 2 for n in range(length)]
-    points = np.array([(halton(1 + k % period, 2), halton(1 + k % period, 3)) for k in steps]).reshape(length, 2)
-    if not every_frame:
-        points[1::2] = (points[1::2] + 0.5) % 1.0
+    points = np.arange(length)[:, None] * np.asarray(KRONECKER_STEP) % 1.0
     return (points - 0.5).astype(np.float32)
 
 

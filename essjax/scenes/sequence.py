@@ -38,7 +38,7 @@ class Rendering(NamedTuple):
     native: bool = False
     ranges: bool = False
     mip_bias: float = 0.0
-    jitter: str = "halton"
+    jitter: str = "kronecker"
 
 
 USUAL = Rendering()
@@ -110,7 +110,7 @@ def render_frame(scene: Scene, index: int, width: int, height: int, *, rendering
         sampled = beside.submit(from_samples)
         frame, valid, steady = _frame(scene, index, width, height, offset, angle)
         if native:
-            offset = jitter_sequence(index + 1, every_frame=True)[index]
+            offset = jitter_sequence(index + 1)[index]
             native_frame, _, _ = _frame(scene, index, wide, high, offset, angle)
     reference, found = sampled.result()
     return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame, ranges=found)

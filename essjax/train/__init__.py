@@ -16,18 +16,19 @@ from essjax.train.loop import (
 from essjax.train.objectives import (
     Objective,
     Recurrent,
-    both_kinds,
     classification_objective,
     composition_objective,
     dlctus_objective,
+    every_phase,
     extranet_objective,
     extrass_objective,
     fasset_objective,
+    fitting_length,
     frnet_objective,
     ifrnet_objective,
     nsrr_objective,
-    odd_length,
     predict_last,
+    whole_periods,
 )
 from essjax.train.state import (
     OPTIMIZERS,
@@ -45,9 +46,9 @@ from essjax.train.step import make_train_step
 
 __all__ = [
     "Budget", "Checkpoints", "Interrupted", "NonFiniteLoss", "OPTIMIZERS", "Objective", "Recurrent", "TrainState",
-    "Validation", "adam", "averaged", "best_validation", "both_kinds", "chosen_variables", "classification_objective",
-    "composition_objective", "constant", "cosine", "create_state", "dlctus_objective", "extranet_objective",
-    "extrass_objective", "fasset_objective", "frnet_objective", "halving", "ifrnet_objective", "learning_rate",
-    "make_train_step", "mean_score", "muon", "nsrr_objective", "odd_length", "predict_last", "read_progress",
-    "restore_stage", "train",
+    "Validation", "adam", "averaged", "best_validation", "chosen_variables", "classification_objective",
+    "composition_objective", "constant", "cosine", "create_state", "dlctus_objective", "every_phase",
+    "extranet_objective", "extrass_objective", "fasset_objective", "fitting_length", "frnet_objective", "halving",
+    "ifrnet_objective", "learning_rate", "make_train_step", "mean_score", "muon", "nsrr_objective", "predict_last",
+    "read_progress", "restore_stage", "train", "whole_periods",
 ]  # fmt: skip

@@ -5,7 +5,7 @@ The clock counts training: a step with the wait for its batch, but neither compi
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,7 +55,7 @@ class Budget(NamedTuple):
 
 
 def train(
-    step_function: Callable,
+    steps: Mapping[str, Callable],
     state: TrainState,
     batches: Iterator,
     checkpoints: Checkpoints,
@@ -73,10 +73,10 @@ def train(
     """Run a stage to the end of its budget, from its newest checkpoint if there is one.
 
     Args:
-      step_function: from ``make_train_step``, or what its ``lower(...).compile()`` gave for these shapes; it is
-        compiled before the clock starts.
+      steps: task -> its step, from ``make_train_step``, or what its ``lower(...).compile()`` gave for these shapes; it
+        is compiled when its first batch comes, which the clock does not count.
       state: the state at step 0; the checkpoint's replaces it.
-      batches: a grain iterator: ``next``, ``get_state``, ``set_state``.
+      batches: of task and batch, a ``data.Mixed``: ``next``, ``get_state``, ``set_state``.
       checkpoints: where the state is kept.
       log_path: JSON lines, one per step; cut back to the checkpoint's step when a run resumes.
       budget: when to end.
@@ -98,6 +98,7 @@ def train(
       Interrupted: a signal came, see ``essjax.stopping``; everything is saved.
       NonFiniteLoss: names the terms; the batch is in ``log_path``'s folder.
     """
+    steps = dict(steps)
     spent, best = read_progress({}), state.variables[trained]
     if checkpoints.latest() is not None:
         state, best, saved = restore_stage(checkpoints, state, trained)
@@ -134,15 +135,16 @@ def train(
                 validate(validation)
         while progress() < 1.0 and not section.asked:
             began = time.monotonic()
-            batch, rate = next(batches), schedule(step, progress())
-            if hasattr(step_function, "lower"):
+            (task, batch), rate = next(batches), schedule(step, progress())
+            if hasattr(steps[task], "lower"):
+                waited = time.monotonic() - began
                 on_compile()
                 began = time.monotonic()
                 with section.at_rest():
-                    step_function = step_function.lower(state, batch, rate).compile()
+                    steps[task] = steps[task].lower(state, batch, rate).compile()
                 spent["compile_seconds"] += time.monotonic() - began
-                began = time.monotonic()
-            state, terms = step_function(state, batch, rate)
+                began = time.monotonic() - waited
+            state, terms = steps[task](state, batch, rate)
             terms = {name: float(value) for name, value in jax.device_get(terms).items()}
             step, spent["seconds"] = step + 1, spent["seconds"] + time.monotonic() - began
             if not all(np.isfinite(value) for value in terms.values()):

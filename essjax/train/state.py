@@ -1,6 +1,8 @@
 """The state that a training stage carries from step to step."""
 
+import dataclasses
 import math
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +24,14 @@ class TrainState:
       variables: all of the method's variables; a stage trains one entry, the others are frozen.
       optimizer: optax state of the trained entry.
       step: steps taken, int32.
-      history: what the next clip goes on from where clips follow each other (``Recurrent``), else None.
+      history: task -> what its next clip goes on from, where clips follow each other (``Recurrent``).
       average: moving average of the trained weights, as one vector; or None.
     """
 
     variables: PyTree
     optimizer: PyTree
     step: Array
-    history: PyTree = None
+    history: dict[str, PyTree] = dataclasses.field(default_factory=dict)
     average: Array | None = None
 
 
@@ -74,10 +76,12 @@ def create_state(
     trained: str,
     transform: optax.GradientTransformation,
     *,
-    history: PyTree = None,
+    history: Mapping[str, PyTree] | None = None,
     average: bool = False,
 ) -> TrainState:
-    """Make a state at step 0 that trains ``variables[trained]``; ``history`` (``Recurrent.start``): successive clips.
+    """Make a state at step 0 that trains ``variables[trained]``.
+
+    ``history``: task -> ``Recurrent.start`` of its first clip, where clips follow each other.
 
     With ``average`` the weights are averaged over the steps, see ``averaged``.
 
@@ -86,7 +90,9 @@ def create_state(
     """
     if trained not in variables:
         raise ValueError(f"trained: expected one of {', '.join(sorted(variables))}, got {trained!r}.")
-    variables, history = jax.tree.map(jnp.array, (variables, history))  # copies: the train step donates its state
+    variables, history = jax.tree.map(
+        jnp.array, (variables, dict(history or {}))
+    )  # copies: the train step donates its state
     weights, _ = split_statistics(variables[trained])
     step = jnp.zeros((), jnp.int32)
     mean = jnp.array(ravel_pytree(weights)[0]) if average else None

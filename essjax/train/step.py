@@ -18,20 +18,22 @@ def make_train_step(
     transform: optax.GradientTransformation,
     trained: str,
     *,
+    task: str = "",
     average: float = 0.99,
     compiler_options: dict[str, Any] | None = None,
 ) -> Callable[[TrainState, Sequence, float], tuple[TrainState, dict[str, Array]]]:
     """``step(state, clip, learning_rate) -> (state, terms)``, jitted, the state donated.
 
     ``terms`` holds the weighted terms, ``loss`` (their sum) and ``gradient_norm``. A step whose loss or gradient is not
-    finite changes nothing but the step count; the loop raises ``NonFiniteLoss``. Where the state holds a history, clips
-    follow each other and ``objective`` is a ``Recurrent``.
+    finite changes nothing but the step count; the loop raises ``NonFiniteLoss``. Where the state holds a history of the
+    task, its clips follow each other and ``objective`` is a ``Recurrent``.
 
     Args:
       objective: ``(variables, clip) -> (terms, state)``; the statistics that it returns for ``trained`` are folded
         into the variables, those of frozen entries are not.
       transform: the optimiser, without its learning rate.
       trained: the entry of ``variables`` that is differentiated; the others are frozen.
+      task: whose clips the step is for, of several that take turns.
       average: decay of the moving average of the weights, where the state holds one.
       compiler_options: for ``jax.jit``.
     """
@@ -42,11 +44,11 @@ def make_train_step(
 
         def loss(weights):
             variables = {**state.variables, trained: {**weights, **statistics}}
-            if state.history is None:
-                terms, new, history = *objective(variables, clip), None
-            else:
-                terms, new, history = objective.follow(variables, clip, state.history)
-            return sum(terms.values()), (terms, new.get(trained, {}), history)
+            if task in state.history:
+                terms, new, history = objective.follow(variables, clip, state.history[task])
+                return sum(terms.values()), (terms, new.get(trained, {}), {**state.history, task: history})
+            terms, new = objective(variables, clip)
+            return sum(terms.values()), (terms, new.get(trained, {}), state.history)
 
         (total, (terms, new_statistics, history)), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
         norm = optax.tree.norm(gradient)

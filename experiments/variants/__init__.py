@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from experiments.variants import baselines, classifier, dlctus, extranet, extrass, fasset, interpolation, nsrr
-from experiments.variants.base import Stage, Variant
+from experiments.variants.base import Stage, Task, Variant
 
 VARIANTS: dict[str, Variant] = {
     **extrass.VARIANTS,
@@ -43,4 +43,4 @@ def compared(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(n for n in dict.fromkeys((*BASELINES, *parts)) if n not in names) + tuple(dict.fromkeys(names))
 
 
-__all__ = ["BASELINES", "VARIANTS", "Stage", "Variant", "compared", "get_variant", "trained_as"]
+__all__ = ["BASELINES", "VARIANTS", "Stage", "Task", "Variant", "compared", "get_variant", "trained_as"]

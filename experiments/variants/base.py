@@ -11,6 +11,23 @@ from essjax.train import Budget, Objective, Recurrent, constant, cosine
 from experiments.settings import Settings, StageSettings, Table, arguments, make_settings
 
 
+class Task(NamedTuple):
+    """Clips of one kind, of which a stage's batches are.
+
+    Attributes:
+      objective: what is minimised.
+      period: one frame in so many is rendered; 1 where all are.
+    """
+
+    objective: Objective | Recurrent
+    period: int
+
+    @property
+    def recurrent(self) -> bool:
+        """Its clips follow each other."""
+        return isinstance(self.objective, Recurrent)
+
+
 @dataclasses.dataclass(frozen=True)
 class Stage:
     """One training stage, ready to be run.
@@ -18,7 +35,7 @@ class Stage:
     Attributes:
       name: also the entry of the variables that it trains; the others are frozen.
       method: the method that is validated.
-      objective: what is minimised.
+      tasks: by name; their batches take turns.
       settings: batch, crop, learning rate, budget.
       decay: of the learning rate, ``progress -> factor``.
       ranges: its objective needs the clips' sample ranges.
@@ -27,7 +44,7 @@ class Stage:
 
     name: str
     method: Method
-    objective: Objective | Recurrent
+    tasks: Mapping[str, Task]
     settings: StageSettings
     decay: Callable[[float], float]
     ranges: bool
@@ -62,14 +79,28 @@ class StageRecipe:
     vgg: Callable[[str], Any] | None = None
 
     def stage(self, name: str, settings: Settings, whole: Method) -> Stage:
-        """Make the stage called ``name`` of a variant whose method is ``whole``."""
+        """Make the stage called ``name`` of a variant whose method is ``whole``.
+
+        Raises:
+          ValueError: it is trained at one rate alone, and ``training.rates`` names others.
+        """
         method = self.method(settings) if self.method else whole
         given = {**vars(settings.stages[name].loss), **self.given(settings)}
         if self.vgg and settings.training.vgg:
             given["vgg_features"] = self.vgg(settings.training.vgg)
-        objective = self.objective(self.unrolls(settings) if self.unrolls else method, **given)
+        unrolled = self.unrolls(settings) if self.unrolls else method
+        if "period" in inspect.signature(self.objective).parameters:
+            periods = {f"1:{period}": period for period in settings.training.rates}
+            tasks = {rate: Task(self.objective(unrolled, **given, period=n), n) for rate, n in periods.items()}
+        elif settings.training.rates != (2,):
+            raise ValueError(
+                f"--set training.rates: {name} is not trained at several rates; expected [2], got "
+                f"{list(settings.training.rates)}. Leave it out, or say VARIANT:training.rates=... for the others."
+            )
+        else:
+            tasks = {"": Task(self.objective(unrolled, **given), 2)}
         decay = self.decay if settings.training.anneal else constant
-        return Stage(name, method, objective, settings.stages[name], decay, self.ranges, self.vgg is not None)
+        return Stage(name, method, tasks, settings.stages[name], decay, self.ranges, self.vgg is not None)
 
 
 class Page(NamedTuple):

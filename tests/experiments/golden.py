@@ -11,7 +11,6 @@ from pathlib import Path
 
 from essjax import methods, train
 from essjax.interfaces import Method, Network
-from essjax.train import Recurrent
 from experiments.members import _member, settings_of
 from experiments.settings import PRESETS
 from experiments.training import check_crop
@@ -78,7 +77,7 @@ def resolved(name, preset):
         "calls": sorted(set(calls)),
         "stages": {
             stage.name: {
-                "method": stage.method.info.name, "recurrent": isinstance(stage.objective, Recurrent),
+                "method": stage.method.info.name, "recurrent": any(task.recurrent for task in stage.tasks.values()),
                 "batch": stage.settings.batch, "clip": stage.settings.clip, "rate": stage.settings.learning_rate,
                 "crop": check_crop(stage.settings, *settings.data.size, settings.data.scale),
                 "decay": [round(stage.decay(progress), 12) for progress in AT],

@@ -15,7 +15,7 @@ from essjax.rollout import alternate, every, unroll
 from experiments import datasets
 from experiments.ahead import batch_shapes, state_shapes
 from experiments.members import resolve, settings_of
-from experiments.training import initial_state, initial_variables, make_batches, make_step
+from experiments.training import initial_state, initial_variables, make_batches, make_steps
 from experiments.variants import VARIANTS
 from tests.helpers import streamed
 
@@ -54,10 +54,10 @@ def train(name, dataset):
     member = resolve({name: settings}, "smoke", Path())[name]
     variables, losses = initial_variables(member, dataset), {}
     for stage in member.stages:
-        batch, losses[stage.name] = next(make_batches(dataset, settings, stage)), []
-        step, state = make_step(stage, settings), initial_state(member, stage, variables, batch)
+        (task, batch), losses[stage.name] = next(make_batches(dataset, settings, stage)), []
+        step, state = make_steps(stage, settings)[task], initial_state(member, stage, variables, {task: batch})
         expected = batch_shapes(settings, stage)  # what the run command compiles for, before there are data
-        assert_same_shapes(expected, batch)
+        assert_same_shapes(expected, {task: batch})
         assert_same_shapes(state_shapes(member, stage, expected), state)
         for _ in range(STEPS):
             state, terms = step(state, batch, stage.settings.learning_rate)

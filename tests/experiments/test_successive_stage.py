@@ -9,7 +9,7 @@ import numpy as np
 from essjax.builtin import generate, plan
 from essjax.train import Checkpoints
 from experiments.members import resolve, settings_of
-from experiments.training import first_batch, initial_state, initial_variables, make_batches, restore_member
+from experiments.training import first_batches, initial_state, initial_variables, make_batches, restore_member
 
 SETTINGS = ["data.size=[40,28]", "stages.crop=[32,24]", "stages.clip=4", "method.width=4", "method.frnet_width=4"]
 
@@ -20,18 +20,18 @@ def test_the_history_is_part_of_what_a_stage_starts_with_and_comes_back(tmp_path
     settings = settings_of("extrass", "smoke", SETTINGS)
     member = resolve({"extrass": settings}, "smoke", tmp_path / "out")["extrass"]
     flow, last = member.stages
-    followed = list(itertools.islice(make_batches(dataset, settings, last), 4))
-    assert followed[0].frames.color.shape[:2] == (3, 2)  # of 4 frames 3: both kinds need an odd number
+    followed = [batch for _, batch in itertools.islice(make_batches(dataset, settings, last), 4)]
+    assert followed[0].frames.color.shape[:2] == (5, 2)  # two periods in either phase: an odd number
     assert followed[0].frames.cut[0].all() and not all(batch.frames.cut[0].all() for batch in followed)
-    assert all(batch.frames.cut[0].all() for batch in itertools.islice(make_batches(dataset, settings, flow), 3))
+    assert all(batch.frames.cut[0].all() for _, batch in itertools.islice(make_batches(dataset, settings, flow), 3))
 
     variables = initial_variables(member, dataset)
-    batch = first_batch(dataset, settings, last)
-    state = initial_state(member, last, variables, batch)
-    assert initial_state(member, flow, variables, first_batch(dataset, settings, flow)).history is None
-    assert state.history.shown.shape == (2, 2, 48, 64, 3)  # both runs
+    batches = first_batches(dataset, settings, last)
+    state = initial_state(member, last, variables, batches)
+    assert initial_state(member, flow, variables, first_batches(dataset, settings, flow)).history == {}
+    assert state.history["1:2"].shown.shape == (2, 2, 48, 64, 3)  # both runs
     for stage in member.stages:
-        saved = initial_state(member, stage, variables, batch)
+        saved = initial_state(member, stage, variables, batches)
         saved = dataclasses.replace(saved, variables=jax.tree.map(lambda leaf: leaf + 1.0, saved.variables))
         checkpoints = Checkpoints(tmp_path / "out" / "checkpoints" / stage.name)
         content = {"state": saved, "best": saved.variables[stage.name]}

@@ -128,8 +128,10 @@ def test_untrained_refinement_keeps_the_warp_of_rough_surfaces():
     frames = random_frames()
     frames = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, roughness=None))  # counts as 1
     warped = 1.0 + random_image(5, 2, B, H, W, 3, high=0.1)
-    variables = network.init(jax.random.key(0), jnp.zeros((2, B, 8, 11, 3)), jnp.zeros((B, 8, 11, 1)))
-    result = jax.jit(lambda *arguments: refine(network, *arguments))(variables, warped, select_time(frames.gbuffers, 0))
+    variables = network.init(jax.random.key(0), jnp.zeros((2, B, 8, 11, 3)), jnp.zeros((B, 8, 11, 1)), jnp.ones((2, B)))
+    ages = jnp.ones((2, B)) * jnp.array([[1.0], [3.0]])
+    run = jax.jit(lambda *arguments: refine(network, *arguments))
+    result = run(variables, warped, select_time(frames.gbuffers, 0), ages)
     np.testing.assert_allclose(result["flow"], 0.0, atol=1e-6)
     np.testing.assert_array_equal(result["mask"], 0.0)
     np.testing.assert_array_equal(result["image"], warped[0])

@@ -55,6 +55,7 @@ def test_work_for_540p():
         variables["frnet"],
         image(2, 1, 270, 480, 3),
         image(1, 270, 480, 1),
+        image(2, 1),
     )
     assert 10 < ss <= 80 and 10 < ess <= 80
     assert max(ss, ess) <= 1.15 * min(ss, ess)
@@ -77,51 +78,57 @@ def randomised(variables, seed=3):
 @pytest.fixture(scope="module")
 def small_frnet():
     network = frnet(4)
-    return network, network.init(jax.random.key(0), jnp.zeros((2, 1, 8, 8, 3)), jnp.zeros((1, 8, 8, 1)))
+    return network, network.init(
+        jax.random.key(0), jnp.zeros((2, 1, 8, 8, 3)), jnp.zeros((1, 8, 8, 1)), jnp.ones((2, 1))
+    )
 
 
 def test_frnet_on_odd_sizes(small_frnet):
     network, variables = small_frnet
     warped, roughness = random_image(0, 2, 2, 7, 11, 3), random_image(1, 2, 7, 11, 1)
     run = jax.jit(lambda v, *inputs: network.apply(v, *inputs)[0])
-    untrained = run(variables, warped, roughness)
+    ages = jnp.array([[1.0, 2.0], [3.0, 5.0]])  # two elements, of different rates
+    untrained = run(variables, warped, roughness, ages)
     assert untrained["flow"].shape == (2, 7, 11, 2)
-    matched = matched_flow(pad_to_multiple(warped, 4), pad_to_multiple(roughness, 4))
+    matched = matched_flow(pad_to_multiple(warped, 4), pad_to_multiple(roughness, 4), ages)
+    matched = ages[0, :, None, None, None] * matched
     np.testing.assert_allclose(untrained["flow"], crop(matched, 7, 11), atol=1e-5)
     assert [f.shape for f in untrained["features"]] == [(2, 8, 12, 4), (2, 4, 6, 6), (2, 2, 3, 8)]
 
-    trained = run(randomised(variables), warped, roughness)
+    trained = run(randomised(variables), warped, roughness, ages)
     assert float(jnp.abs(trained["flow"] - untrained["flow"]).max()) > 1e-3
-    padded = run(randomised(variables), pad_to_multiple(warped, 4), pad_to_multiple(roughness, 4))
+    padded = run(randomised(variables), pad_to_multiple(warped, 4), pad_to_multiple(roughness, 4), ages)
     np.testing.assert_allclose(trained["flow"], crop(padded["flow"], 7, 11), rtol=1e-4, atol=1e-5)
     encoded, state = network.apply(variables, random_image(2, 2, 7, 11, 3), method="encode")
     assert [f.shape for f in encoded] == [f.shape for f in untrained["features"]] and state == {}
 
 
-@pytest.mark.parametrize("flow", [(1, 0), (0, 1), (-1, 1)])
-def test_matching_finds_shading_that_moves_evenly(flow):
+@pytest.mark.parametrize(("flow", "ages"), [((1, 0), (3, 7)), ((0, 1), (2, 5)), ((-1, 1), (1, 3)), ((1, 1), (1, 4))])
+def test_matching_finds_shading_that_moves_evenly(flow, ages):
     """A picture that moved by whole pixels, on a mirror (left half) and on a rough surface (right half)."""
     picture = 0.2 * np.asarray(random_image(4, 40, 40, 3, high=1.0))
     y, x = np.mgrid[8:32, 8:32]
-    # newest(x + f) = older(x + 3 f) = what is seen now.
-    warped = jnp.stack([jnp.asarray(picture[y - k * flow[1], x - k * flow[0]]) for k in (1, 3)])
+    # newest(x + a f) = older(x + b f) = what is seen now, frames of a and b frames ago.
+    warped = jnp.stack([jnp.asarray(picture[y - k * flow[1], x - k * flow[0]]) for k in ages])
     roughness = jnp.where(jnp.arange(24) < 12, 0.1, 0.9)[None, :, None] * jnp.ones((24, 24, 1))
-    found = np.asarray(jax.jit(matched_flow)(warped, roughness))
+    found = np.asarray(jax.jit(matched_flow)(warped, roughness, jnp.array(ages, jnp.float32)))
     np.testing.assert_allclose(found[8:16, 8:11], np.broadcast_to(flow, (8, 3, 2)), atol=0.02)
     np.testing.assert_allclose(found[:, 12:], 0.0, atol=1e-4)
 
 
 def test_matching_reads_what_a_warp_reads():
-    """Every offset, tripled too: slices of the half-pixel images against the bilinear warp."""
-    image = random_image(6, 7, 9, 3)
-    for x, y in np.concatenate([OFFSETS, 3 * OFFSETS]).tolist():
-        warped = backward_warp(image, jnp.full((7, 9, 2), jnp.array([x, y])))
-        np.testing.assert_allclose(_read(_halfway(image), x, y, (7, 9)), warped, atol=1e-5)
+    """Every offset at every age, of two elements at once: slices of the half-pixel images against the bilinear warp."""
+    image = random_image(6, 2, 7, 9, 3)
+    read = jax.jit(lambda ages, offset: _read(_halfway(image), ages, offset, (7, 9)))
+    for ages in ([1.0, 3.0], [2.0, 7.0]):
+        for offset in OFFSETS:
+            flow = jnp.array(ages)[:, None, None, None] * jnp.broadcast_to(offset, (2, 7, 9, 2))
+            np.testing.assert_allclose(read(jnp.array(ages), offset), backward_warp(image, flow), atol=1e-5)
 
 
 def test_matching_of_equal_frames_finds_no_motion():
     image = random_image(5, 12, 16, 3)
-    found = matched_flow(jnp.stack([image, image]), jnp.zeros((12, 16, 1)))
+    found = matched_flow(jnp.stack([image, image]), jnp.zeros((12, 16, 1)), jnp.array([1.0, 3.0]))
     np.testing.assert_allclose(found[4:8, 4:12], 0.0, atol=1e-3)
 
 

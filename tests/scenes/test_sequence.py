@@ -61,7 +61,7 @@ def test_sequence_is_valid_with_native_frames_and_resumes():
     assert sequence.frames.color.shape == (3, 20, 36, 3) and sequence.frames.color.dtype == np.float32
     assert sequence.native.color.shape == (3, 40, 72, 3) and sequence.frames.gbuffers.stencil.dtype == np.int32
     assert sequence.frames.gbuffers.stencil.max() > 3
-    np.testing.assert_array_equal(sequence.native.jitter, scenes.jitter_sequence(3, every_frame=True))
+    np.testing.assert_array_equal(sequence.native.jitter, scenes.jitter_sequence(3))
     np.testing.assert_array_equal(sequence.frames.jitter, scenes.jitter_sequence(3))
     assert list(sequence.frames.cut) == [True, False, False]
     resumed = list(scenes.iterate_frames(scene, *SIZE, start=2, rendering=Rendering(spp=4, native=True)))

@@ -84,6 +84,26 @@ def test_terms_equal_numpy():
     np.testing.assert_array_equal(history[-6:, 0], np.arange(1, 7))
 
 
+def test_at_one_in_three_both_distances_count():
+    """The mean over frames that are one and two frames away from the last rendered one, seen from the kinds of steps."""
+    seen = []
+
+    def listen(step, kind):
+        def run(variables, history, frame, *, train=False):
+            seen.append((kind, frame.color is None))
+            return step(variables, history, frame, train=train)
+
+        return run
+
+    method = fake(SHADING, MASK)
+    steps = {name: listen(getattr(method, name), name[0]) for name in ("render_step", "extrapolate_step")}
+    terms, _ = extranet_objective(method._replace(**steps), period=3)({"extranet": jnp.float32(0.5)}, numbered(9))
+    once, _ = extranet_objective(method)({"extranet": jnp.float32(0.5)}, numbered(9))
+    np.testing.assert_allclose(terms["l1"], once["l1"], rtol=1e-5)  # the fake shows the same at every distance
+    kinds = "".join(kind for kind, _ in seen)
+    assert kinds.endswith("ree")
+
+
 def test_training_learns_how_the_light_moves():
     """A resting wall under moving light: the warp alone shows the light of a frame ago. Steps by sign, as Adam's first.
 

@@ -35,25 +35,32 @@ def clip_of(length, exact):
 
 
 @pytest.mark.parametrize("exact", [True, False], ids=["exact holes", "the network's holes"])
-def test_terms_equal_numpy(exact):
-    clip = clip_of(T + 1, exact)  # an even number: the last frame is left out
-    objective = fasset_objective(fake(aux), hole_weight=5.0, hard_weight=0.7, share=0.1)
+@pytest.mark.parametrize("period", [2, 3])
+def test_terms_equal_numpy(exact, period):
+    clip = clip_of(T + 1, exact)
+    objective = fasset_objective(fake(aux), hole_weight=5.0, hard_weight=0.7, share=0.1, period=period)
     terms, state = jax.jit(lambda clip: objective({}, clip))(clip)
     assert not state and len(terms) == 6
-    target = np.log1p(np.asarray(clip.reference, np.float64)[1 : T - 1])
-    for kind, name in enumerate((SS, ESS)):
-        image = np.stack([np.asarray(IMAGES[kind], np.float64) + 0.1 * n for n in range(1, T - 1)])[:, None]
-        errors = np.abs(image - target)  # [T - 2, B, 2H, 2W, 3]
-        np.testing.assert_allclose(terms[f"l1_{name}"], errors.mean(), rtol=1e-5)
+    count = (T + 1 - period + 1) // period * period  # the frames left over are left out
+    expected = dict.fromkeys(terms, 0.0)
+    for distance in range(period):
+        kind, name, share = min(distance, 1), ESS if distance else SS, 1 / (period - 1) if distance else 1.0
+        frames = np.arange(distance, distance + count)
+        image = np.stack([np.asarray(IMAGES[kind], np.float64) + 0.1 * n for n in frames])[:, None]
+        errors = np.abs(image - np.log1p(np.asarray(clip.reference, np.float64)[frames]))  # [count, B, 2H, 2W, 3]
         if exact:
-            hole = 1 - np.asarray(clip.valid)[1 : T - 1].repeat(2, axis=2).repeat(2, axis=3)
+            hole = 1 - np.asarray(clip.valid)[frames].repeat(2, axis=2).repeat(2, axis=3)
         else:
             hole = np.broadcast_to((np.arange(2 * W) < 2 * (kind + 1))[:, None], (*errors.shape[:-1], 1))
-        np.testing.assert_allclose(terms[f"hole_{name}"], 5 * errors[(hole[..., 0] > 0)].mean(), rtol=1e-5)
-        pixels = errors.mean(axis=-1).reshape(T - 2, B, -1)
-        count = round(0.1 * pixels.shape[-1])
-        hard = np.sort(pixels, axis=-1)[..., -count:].sum() / pixels.size  # eq 4 divides by all pixels
-        np.testing.assert_allclose(terms[f"hard_{name}"], 0.7 * hard, rtol=1e-5)
+        hole = hole * (frames > 0).reshape(-1, 1, 1, 1, 1)  # frame 0 is a cut
+        pixels = errors.mean(axis=-1).reshape(count, B, -1)
+        worst = round(0.1 * pixels.shape[-1])
+        expected[f"l1_{name}"] += share * errors.mean()
+        expected[f"hole_{name}"] += share * 5 * errors[(hole[..., 0] > 0)].mean()
+        # Eq 4 divides by all pixels.
+        expected[f"hard_{name}"] += share * 0.7 * np.sort(pixels, axis=-1)[..., -worst:].sum() / pixels.size
+    for name, value in expected.items():
+        np.testing.assert_allclose(terms[name], value, rtol=1e-5, err_msg=name)
 
 
 def test_target_of_extranet_plus():

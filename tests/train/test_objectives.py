@@ -13,8 +13,8 @@ from essjax.interfaces import Method, MethodInfo, Network, reset_at_cut
 from essjax.losses import census, feature_census
 from essjax.methods._extrass import Warped
 from essjax.rollout import ESS, SS
-from essjax.train import Recurrent, both_kinds, extrass_objective, frnet_objective
-from essjax.train.objectives.common import follow_both_kinds, since_cut, start_both_kinds
+from essjax.train import Recurrent, every_phase, extrass_objective, frnet_objective, whole_periods
+from essjax.train.objectives.common import follow_every_phase, since_cut, start_every_phase
 from tests.helpers import make_sequence, random_image
 
 T, B, H, W = 5, 2, 14, 18
@@ -48,38 +48,53 @@ def fake(step_aux):
     return exposed(Method(lambda key, example: {}, start, step(0), step(1), MethodInfo("fake", 1)))
 
 
-@pytest.mark.parametrize("length", [3, 7])
-def test_both_kinds_gives_every_inner_frame_once_per_kind_in_order(length):
-    def aux(variables, history, frame, kind):
-        number = frame.motion[..., 0, 0, 0]
-        return {"frame": number, "kind": jnp.full_like(number, kind), "before": history}
+def said(variables, history, frame, kind):
+    """What a step was given: its frame's number, its kind, the history."""
+    number = frame.motion[..., 0, 0, 0]
+    return {"frame": number, "kind": jnp.full_like(number, kind), "before": history}
 
-    kinds, _ = jax.jit(lambda clip: both_kinds(fake(aux), {}, clip, keep=lambda aux: aux))(numbered(length))
-    assert set(kinds) == {SS, ESS}
-    inner = np.arange(1, length - 1)
-    for name, number in ((SS, 0), (ESS, 1)):
-        kept = kinds[name]
-        assert kept["frame"].shape == (length - 2, B)
+
+@pytest.mark.parametrize(("length", "period"), [(3, 2), (7, 2), (5, 3), (11, 3), (11, 4)])
+def test_every_phase_gives_each_frame_once_per_distance_in_order(length, period):
+    phases = []
+
+    @jax.jit
+    def run(clip):
+        phases.extend(every_phase(fake(said), {}, clip, lambda aux: aux, period)[0])
+        return [phase.kept for phase in phases]
+
+    found = run(numbered(length))
+    assert [(phase.distance, phase.kind) for phase in phases] == [(d, ESS if d else SS) for d in range(period)]
+    for d, (phase, kept) in enumerate(zip(phases, found, strict=True)):
+        frames = np.arange(d, d + length - period + 1)
+        np.testing.assert_array_equal(np.arange(length)[phase.frames], frames)
         for b in range(B):
-            np.testing.assert_array_equal(kept["frame"][:, b], inner)
-            np.testing.assert_array_equal(kept["kind"][:, b], number)
-            expected = np.stack([inner - 1, np.full_like(inner, 1 - number)], axis=-1)  # the alternation's history
-            if name == SS:
-                expected[0] = -1  # the second run starts there, without history
+            np.testing.assert_array_equal(kept["frame"][:, b], frames)
+            np.testing.assert_array_equal(kept["kind"][:, b], min(d, 1))
+            # The schedule's history: rendered frames follow the last extrapolated one, all others a frame later.
+            expected = np.stack([frames - 1, np.full_like(frames, d != 1)], axis=-1)
+            if d == 0:
+                expected[:period] = -1  # the runs start there, without history
             np.testing.assert_array_equal(kept["before"][:, b], expected)
 
 
-@pytest.mark.parametrize("length", [1, 2, 4])
-def test_even_or_short_clips_are_refused(length):
-    message = f"clip: expected an odd number of frames >= 3 .*, got {length}"
+@pytest.mark.parametrize(("length", "period", "fitting"), [(1, 2, 0), (2, 2, 0), (4, 2, 3), (4, 3, 0), (10, 3, 8)])
+def test_clips_that_do_not_fit_are_cut_or_refused(length, period, fitting):
+    message = f"clip: expected {period - 1} frames and a multiple of {period} .*, got {length}"
     with pytest.raises(ValueError, match=message):
-        both_kinds(fake(lambda *_: {}), {}, numbered(length), keep=lambda aux: aux)
+        every_phase(fake(lambda *_: {}), {}, numbered(length), lambda aux: aux, period)
+    if fitting:
+        assert whole_periods(numbered(length), period).reference.shape[0] == fitting
+    else:
+        with pytest.raises(ValueError, match=f"clip: expected at least {2 * period - 1} frames .*, got {length}"):
+            whole_periods(numbered(length), period)
 
 
-def follow(objective, windows, length):
-    """Terms of clips that follow each other in ``numbered``: window k is frames k (length - 1) and on."""
-    whole = numbered((length - 1) * windows + 1)
-    parts = [select_time(whole, slice(k * (length - 1), (k + 1) * (length - 1) + 1)) for k in range(windows)]
+def follow(objective, windows, step):
+    """Terms of clips that follow each other in ``numbered``: window k begins at frame k * step."""
+    length = step + objective.period - 1
+    whole = numbered(step * (windows - 1) + length)
+    parts = [select_time(whole, slice(k * step, k * step + length)) for k in range(windows)]
     history, found, run = objective.start(parts[0]), [], jax.jit(objective.follow)
     for number, part in enumerate(parts):
         cut = part.frames.cut.at[0].set(number == 0)
@@ -89,21 +104,19 @@ def follow(objective, windows, length):
     return found
 
 
-def test_both_runs_go_on_where_the_clip_before_ended():
-    """Every frame has the history that one long clip gives it; frame 0 of a clip is the last of the one before."""
+@pytest.mark.parametrize("period", [2, 3])
+def test_all_runs_go_on_where_the_clip_before_ended(period):
+    """Every frame has the history that one long clip gives it."""
+    method = fake(said)
 
-    def aux(variables, history, frame, kind):
-        number = frame.motion[..., 0, 0, 0]
-        return {"frame": number, "kind": jnp.full_like(number, kind), "before": history}
+    def follow_it(variables, clip, history):
+        phases, state, history = follow_every_phase(method, variables, clip, lambda aux: aux, history, period)
+        return [phase.kept for phase in phases], state, history
 
-    method = fake(aux)
-    recurrent = Recurrent(
-        lambda clip: start_both_kinds(method, clip),
-        lambda variables, clip, history: tuple(follow_both_kinds(method, variables, clip, lambda aux: aux, history)),
-    )
-    (whole,) = follow(recurrent, 1, 13)
-    for number, part in enumerate(follow(recurrent, 3, 5)):
-        expected = jax.tree.map(lambda leaf, first=4 * number: leaf[first : first + 3], whole)
+    recurrent = Recurrent(lambda clip: start_every_phase(method, clip, period), follow_it, period)
+    (whole,) = follow(recurrent, 1, 12)
+    for number, part in enumerate(follow(recurrent, 2, 6)):
+        expected = jax.tree.map(lambda leaf, first=6 * number: leaf[first : first + 6], whole)
         jax.tree.map(np.testing.assert_array_equal, part, expected)
 
 
@@ -136,34 +149,45 @@ def weighted(values, mask):
     return np.sum(values * mask) / np.sum(mask)
 
 
-@pytest.mark.parametrize("exact_masks", [True, False])
-def test_extrass_terms_equal_numpy(exact_masks):
+@pytest.mark.parametrize(("exact_masks", "period"), [(True, 2), (False, 3)])
+def test_extrass_terms_equal_numpy(exact_masks, period):
     clip = numbered(T)
     clip = clip if exact_masks else dataclasses.replace(clip, valid=None)
     vgg = lambda image: [image[..., ::2, ::2, :], 3.0 * image[..., :1]]
-    objective = extrass_objective(
-        fake(extrass_aux), occlusion_weight=2.0, vgg_weight=0.5, temporal_weight=3.0, vgg_features=vgg
-    )
-    terms, _ = jax.jit(objective)({}, clip)
+    options = {"occlusion_weight": 2.0, "vgg_weight": 0.5, "temporal_weight": 3.0, "vgg_features": vgg}
+    terms, _ = jax.jit(extrass_objective(fake(extrass_aux), period=period, **options))({}, clip)
 
-    number = np.repeat(np.arange(1, T - 1), B).reshape(T - 2, B, 1, 1, 1)
-    brightness, weight = 1.0 + 0.1 * number, (number + 1) / 8.0
-    reference = np.asarray(clip.reference[1:-1])
-    target = seen(reference)
+    count = T - period + 1
     expected = {"features": 0.0}
-    for kind, name in ((0, SS), (1, ESS)):
+    for distance in range(period):
+        kind, name, share = min(distance, 1), ESS if distance else SS, 1 / max(period - 1, 1) if distance else 1.0
+        frames = np.arange(distance, distance + count)
+        number = np.repeat(frames, B).reshape(count, B, 1, 1, 1)
+        brightness, weight = 1.0 + 0.1 * number, (number + 1) / 8.0
+        reference = np.asarray(clip.reference[frames])
+        target = seen(reference)
         colors = [np.expm1(np.asarray(pattern[kind]) * brightness) for pattern in (IMAGES, HISTORIES)]
         image, history = map(seen, colors)
-        own = np.broadcast_to(np.asarray(VALID[kind], np.float64), (T - 2, B, 2 * H, 2 * W, 1))
-        valid = np.repeat(np.repeat(clip.valid[1:-1], 2, axis=2), 2, axis=3) if exact_masks else own
-        expected[f"l1_{name}"] = weighted(np.abs(image - target), weight)
-        expected[f"occlusion_{name}"] = 2.0 * weighted(np.abs(image - target), weight * (1.0 - valid))
-        expected[f"temporal_{name}"] = 3.0 * weighted(np.abs(image - history), weight * own)
+        own = np.broadcast_to(np.asarray(VALID[kind], np.float64), (count, B, 2 * H, 2 * W, 1))
+        valid = np.repeat(np.repeat(clip.valid[frames], 2, axis=2), 2, axis=3) if exact_masks else own
+        hole = weight * (1.0 - valid) * (number > 0)
         difference = colors[0] - reference
         levels = difference[..., ::2, ::2, :], 3.0 * difference[..., :1]
-        expected[f"vgg_{name}"] = 0.5 * sum(weighted(level**2, weight) for level in levels)
+        found = {
+            "l1": weighted(np.abs(image - target), weight),
+            "occlusion": 2.0 * weighted(np.abs(image - target), hole),
+            "temporal": 3.0 * weighted(np.abs(image - history), weight * own),
+            "vgg": 0.5 * sum(weighted(level**2, weight) for level in levels),
+        }
+        for term, value in found.items():
+            expected[f"{term}_{name}"] = expected.get(f"{term}_{name}", 0.0) + share * value
+    # Frames that are there in every phase, but for those that begin a run as SS.
+    common = np.arange(period, count)
     for a, b in zip(FEATURES[0], FEATURES[1], strict=True):
-        expected["features"] += 3.0 * weighted(np.abs(a - b) * brightness[1:], weight[1:])  # frame 1 is left out
+        if len(common):
+            weight = ((common + 1) / 8.0).reshape(-1, 1, 1, 1, 1)
+            brightness = 1.0 + 0.1 * common.reshape(-1, 1, 1, 1, 1)
+            expected["features"] += 3.0 * weighted(np.abs(a - b) * brightness, weight)
     assert set(terms) == set(expected)
     for name, value in expected.items():
         np.testing.assert_allclose(terms[name], value, rtol=1e-4, err_msg=name)
@@ -180,9 +204,9 @@ def test_frames_since_a_cut():
 def test_a_frame_counts_the_more_the_longer_its_shot_has_lasted():
     """(n + 1) / 8 for frame n of a start; all alike in the clip that follows it."""
     reference = seen(numbered(17).reference)
-    for number, terms in enumerate(follow(extrass_objective(fake(extrass_aux)), 2, 9)):
-        frames = np.arange(1, 8) + 8 * number
-        images = np.asarray(IMAGES[0]) * (1.0 + 0.1 * frames).reshape(7, 1, 1, 1, 1)
+    for number, terms in enumerate(follow(extrass_objective(fake(extrass_aux)), 2, 8)):
+        frames = np.arange(8) + 8 * number
+        images = np.asarray(IMAGES[0]) * (1.0 + 0.1 * frames).reshape(8, 1, 1, 1, 1)
         errors = np.abs(seen(np.expm1(images)) - reference[frames]).mean(axis=(1, 2, 3, 4))
         weight = np.minimum((frames + 1) / 8, 1.0)
         np.testing.assert_allclose(terms["l1_ss"], np.sum(weight * errors) / np.sum(weight), rtol=1e-5)
@@ -190,7 +214,7 @@ def test_a_frame_counts_the_more_the_longer_its_shot_has_lasted():
 
 @pytest.mark.parametrize(("length", "expected"), [(3, 0.0), (7, 3.0)])
 def test_features_are_compared_where_both_encoders_see_history(length, expected):
-    """E0's are 9 where there is no history (frame 1), else 1; E1's are 0. Of three frames none is left."""
+    """E0's are 9 where there is no history (frames 0 and 1), else 1; E1's are 0. Of three frames none is left."""
 
     def aux(variables, history, frame, kind):
         value = jnp.where(history[..., 0] < 0, 9.0, 1.0) * (1 - kind)
@@ -221,7 +245,7 @@ LEVELS = [random_image(81 + level, H // 2, W // 2, 2) for level in (0, 1)]
 
 @pytest.mark.parametrize(("length", "first"), [(3, 1), (5, 3), (7, 3)])
 def test_frnet_terms_equal_numpy(length, first):
-    """From frame 3 on, where the two rendered frames differ, if there is such a frame."""
+    """From frame 3 on, where the two rendered frames differ, if there is such a frame; the last frame counts too."""
 
     def aux(variables, history, frame, kind):
         if kind == 0:
@@ -237,9 +261,9 @@ def test_frnet_terms_equal_numpy(length, first):
     objective = frnet_objective(method, feature_weight=0.5)
     terms, _ = jax.jit(objective)({"frnet": jnp.float32(2.0)}, clip)
 
-    scored = np.arange(first, length - 1)
+    scored = np.arange(first, length)
     brightness = np.repeat(1.0 + 0.1 * scored, B).reshape(len(scored), B, 1, 1, 1)
-    color = np.asarray(clip.frames.color[first:-1]).reshape(len(scored), B, H // 2, 2, W // 2, 2, 3)
+    color = np.asarray(clip.frames.color[first:]).reshape(len(scored), B, H // 2, 2, W // 2, 2, 3)
     target = np.log1p(color.mean(axis=(3, 5)))
     half = np.asarray(HALF) * brightness
     np.testing.assert_allclose(terms["charbonnier"], np.sqrt((half - target) ** 2 + 1e-6).mean(), rtol=1e-4)

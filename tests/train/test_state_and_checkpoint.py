@@ -161,17 +161,17 @@ def test_a_recurrent_objective_carries_its_history_in_the_state(tmp_path):
     clips = [jax.tree.map(jnp.asarray, next(batches)) for _ in range(2)]
     state, step = tiny_run.initial_state(), make_train_step(objective, adam(), "fit")
     variables = {name: state.variables[name] for name in ("fit", "frozen")}
-    state = create_state(variables, "fit", adam(), history=objective.start(clips[0]))
+    state = create_state(variables, "fit", adam(), history={"": objective.start(clips[0])})
     for clip in clips:
         state, _ = step(state, clip, 0.1)
     expected = np.asarray(clips[0].frames.color[0] + clips[1].frames.color[0])
-    np.testing.assert_allclose(state.history, expected, rtol=1e-6)
+    np.testing.assert_allclose(state.history[""], expected, rtol=1e-6)
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(2, state, {"seconds": 1.0})
-    np.testing.assert_array_equal(checkpoints.restore(state)[0].history, state.history)
+    np.testing.assert_array_equal(checkpoints.restore(state)[0].history[""], state.history[""])
     checkpoints.close()
     bad = jax.tree.map(lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, clips[0])
-    np.testing.assert_allclose(step(state, bad, 0.1)[0].history, expected, rtol=1e-6)
+    np.testing.assert_allclose(step(state, bad, 0.1)[0].history[""], expected, rtol=1e-6)
     np.testing.assert_allclose(
         objective(variables, clips[0])[0]["near"], tiny_run.objective(variables, clips[0])[0]["near"]
     )

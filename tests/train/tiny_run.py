@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.data import clips
+from essjax.data import Mixed, clips
 from essjax.frames import select_time
 from essjax.train import (
     Budget,
@@ -78,7 +78,8 @@ def run(folder, *, step=None, budget=None, save_every=1e9, batches=None, **optio
     checkpoints = Checkpoints(Path(folder) / "checkpoints")
     try:
         variables, summary = train(
-            step or tiny_step(), initial_state(), batches or tiny_batches(), checkpoints, Path(folder) / "log.jsonl",
+            {"": step or tiny_step()}, initial_state(), Mixed({"": batches or tiny_batches()}), checkpoints,
+            Path(folder) / "log.jsonl",
             budget or Budget(STEPS, None), functools.partial(learning_rate, peak=0.1), trained="fit",
             save_every=save_every, **{"validation": validation(), **options},
         )  # fmt: skip

@@ -1,6 +1,7 @@
-"""The type of objectives, and the rollouts of which they are made: every frame as both kinds, or the last alone."""
+"""The type of objectives, and the rollouts of which they are made: every frame in every phase, or the last alone."""
 
 import dataclasses
+from collections.abc import Iterable
 from functools import partial
 from typing import NamedTuple
 
@@ -26,8 +27,8 @@ def _begun(clip: Sequence) -> Sequence:
 def since_cut(cut: Array) -> Array:
     """How many frames ago the last cut was, int32 ``[T, ...]``: 0 at a cut, far more than T before the first one.
 
-    In the alternation a frame that is not rendered has one rendered frame to be made of from 1 on, two from 3 on; at 0
-    it has none, and is no target.
+    A frame that was rendered d frames ago has that one to be made of from d on, the one ``period`` before it too from
+    d + period on; before d it has none, and is no target.
 
     Args:
       cut: bool ``[T, ...]``.
@@ -44,102 +45,163 @@ def frame_mean(values: Image, weight: Array) -> Array:
     return masked_mean(jnp.mean(values, axis=(-3, -2, -1)), weight)
 
 
+def mean_of(values: Iterable[Array]) -> Array:
+    """Mean of several terms."""
+    values = list(values)
+    return sum(values[1:], start=values[0]) / len(values)
+
+
+def by_kind(terms: list[dict[str, Array]]) -> dict[str, Array]:
+    """Name the terms of phases, by distance from 0 on, by kind: "l1" becomes "l1_ss" and "l1_ess", a mean."""
+    kinds = (SS, terms[:1]), (ESS, terms[1:])
+    return {f"{name}_{kind}": mean_of(each[name] for each in part) for kind, part in kinds for name in part[0]}
+
+
 @dataclasses.dataclass(frozen=True)
 class Recurrent:
     """An objective that may carry its history from clip to clip: truncated backpropagation through time.
 
     Clips then follow each other (``data.successive_clips``): the network learns from histories as long as a shot, at
     the price of short clips; gradients end where a clip begins. Called as a plain ``Objective`` every clip starts anew,
-    and the last frame of an even number is left out.
+    and the last frames of a number that does not fit are left out.
 
     Attributes:
       start: ``(clip) -> history`` before its frame 0, which is a cut.
       follow: ``(variables, clip, history) -> (terms, statistics, history)``, forgetting at cuts.
+      period: one frame in so many is rendered.
     """
 
     start: Callable[[Sequence], PyTree]
     follow: Callable[[PyTree, Sequence, PyTree], tuple[dict[str, Array], PyTree, PyTree]]
+    period: int = 2
 
     def __call__(self, variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         """Return the terms of a clip that nothing precedes, and the new statistics."""
-        clip = _begun(odd_length(clip))
+        clip = _begun(whole_periods(clip, self.period))
         return self.follow(variables, clip, self.start(clip))[:2]
 
 
-class BothKinds(NamedTuple):
-    """The results of a clip, unrolled twice.
+class Phase(NamedTuple):
+    """A clip's frames as they are predicted ``distance`` frames after the last rendered one.
 
     Attributes:
-      kinds: kind -> what was kept of frames 1 ... T-2, time-major.
-      state: the new statistics, see ``Rollout.state``.
-      history: of both runs after their last frame, for the clip that begins with this one's last frame.
+      distance: 0 where they are rendered themselves.
+      frames: which of the clip's they are.
+      kept: what was kept of them, time-major.
     """
 
-    kinds: dict[str, PyTree]
+    distance: int
+    frames: slice
+    kept: PyTree
+
+    @property
+    def kind(self) -> str:
+        """Rendered or extrapolated."""
+        return ESS if self.distance else SS
+
+
+class Phases(NamedTuple):
+    """The results of a clip in every phase.
+
+    Attributes:
+      phases: by distance, from 0 on.
+      state: the new statistics, see ``Rollout.state``.
+      history: of all runs after their last frame, for the clip that begins with the frame after the first run's.
+    """
+
+    phases: list[Phase]
     state: PyTree
     history: PyTree
 
 
-def _two_runs(frames: Frame) -> Frame:
-    """Frames 0 ... T-2 and 1 ... T-1 side by side, ``[T-1, 2, B, ...]``; the second run forgets what the first does."""
-    length = frames.motion.shape[0]
-    if length < 3 or length % 2 == 0:
-        raise ValueError(f"clip: expected an odd number of frames >= 3 (SS/ESS pairs from 0 and from 1), got {length}.")
-    runs = jax.tree.map(lambda leaf: jnp.stack([leaf[:-1], leaf[1:]], axis=1), frames)
-    return dataclasses.replace(runs, cut=runs.cut.at[0, 1].set(frames.cut[0] | frames.cut[1]))
+def fitting_length(length: int, period: int) -> int:
+    """Return how many frames of ``length`` all ``period`` runs can share: a whole number of periods each, 0 if none.
 
-
-def start_both_kinds(method: Method, clip: Sequence) -> PyTree:
-    """Make the history that ``follow_both_kinds`` needs for a clip whose frame 0 is a cut."""
-    return method.start(select_time(_two_runs(clip.frames), 0))
-
-
-def follow_both_kinds(
-    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree], history: PyTree
-) -> BothKinds:
-    """``both_kinds`` of a clip whose frame 0 is the last frame of the clip before, which left ``history``.
-
-    Each run goes on with the frame that follows its last one: the first with frame 0, the second with frame 1.
-    Where frame 0 is a cut both start anew. Raises as ``both_kinds``.
+    Run r takes frames r ... r + n - 1, n a multiple of the period: n + period - 1 frames in all.
     """
-    frames = _two_runs(clip.frames)
-    rollout = unroll(method, variables, frames, alternate(0), train=True, keep=keep, history=history)
-
-    def interleave(leaf: Array, first: int) -> Array:
-        """Frames 1, 2, ...: from run ``first`` the pair k, then from the other run the pair k + 1 (or k)."""
-        odd, even = leaf[:, first], leaf[:, 1 - first]
-        # Run 0 renders frames 0, 2, ... and extrapolates 1, 3, ...; run 1 renders 1, 3, ... and extrapolates 2, 4, ...
-        even = even[1:] if first == 1 else even[:-1]
-        pairs = jnp.stack([odd[:-1], even], axis=1).reshape(-1, *odd.shape[1:])
-        return jnp.concatenate([pairs, odd[-1:]])
-
-    ordered = {SS: 1, ESS: 0}  # the run that has frame 1 as this kind
-    kinds = {kind: jax.tree.map(partial(interleave, first=run), rollout.aux[kind]) for kind, run in ordered.items()}
-    return BothKinds(kinds, rollout.state, rollout.history)
+    taken = (length - period + 1) // period * period
+    return taken + period - 1 if taken > 0 else 0
 
 
-def both_kinds(
-    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree]
-) -> tuple[dict[str, PyTree], PyTree]:
-    """Unroll ``clip`` twice, the second time from frame 1, side by side in one scan; both alternate SS, ESS, SS, ...
-
-    Where one run renders the other extrapolates, so frames 1 ... T-2 are predicted as both kinds. As ESS, those that
-    are cuts are made of nothing: see ``since_cut``.
-
-    Returns:
-      kind -> ``keep(aux)`` of frames 1 ... T-2, time-major; and the new statistics, see ``Rollout.state``.
+def whole_periods(clip: Sequence, period: int = 2) -> Sequence:
+    """``clip`` without the last frames that ``every_phase`` has no use for.
 
     Raises:
-      ValueError: the number of frames is even (SS/ESS pairs start from frames 0 and 1; see ``odd_length``) or below 3.
+      ValueError: it is too short.
+    """
+    length = clip.frames.motion.shape[0]
+    fitting = fitting_length(length, period)
+    if not fitting:
+        raise ValueError(
+            f"clip: expected at least {2 * period - 1} frames (each in every phase of a period of {period}), got "
+            f"{length}."
+        )
+    return clip if fitting == length else select_time(clip, slice(0, fitting))
+
+
+def _runs(frames: Frame, period: int) -> Frame:
+    """Make ``period`` runs side by side, ``[n, period, B, ...]``, each a frame later; all forget at the same cuts."""
+    length = frames.motion.shape[0]
+    if length != fitting_length(length, period):
+        raise ValueError(
+            f"clip: expected {period - 1} frames and a multiple of {period} (one frame in {period} is rendered), got "
+            f"{length}."
+        )
+    count = length - period + 1
+    runs = jax.tree.map(lambda leaf: jnp.stack([leaf[r : r + count] for r in range(period)], axis=1), frames)
+    cut = runs.cut
+    for r in range(1, period):
+        cut = cut.at[0, r].set(jnp.any(frames.cut[: r + 1], axis=0))
+    return dataclasses.replace(runs, cut=cut)
+
+
+def start_every_phase(method: Method, clip: Sequence, period: int = 2) -> PyTree:
+    """Make the history that ``follow_every_phase`` needs for a clip whose frame 0 is a cut."""
+    return method.start(select_time(_runs(clip.frames, period), 0))
+
+
+def follow_every_phase(
+    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree], history: PyTree, period: int = 2
+) -> Phases:
+    """``every_phase`` of a clip that begins ``period - 1`` frames before the end of the clip that left ``history``.
+
+    Each run goes on with the frame that follows its last one: the first with frame 0, the second with frame 1, ...
+    Where frame 0 is a cut all start anew. Raises as ``every_phase``.
+    """
+    frames = _runs(clip.frames, period)
+    rollout = unroll(method, variables, frames, alternate(period=period), train=True, keep=keep, history=history)
+    count = frames.motion.shape[0]
+
+    def at(leaf: Array, distance: int) -> Array:
+        """Frames ``distance`` ... of the clip: run r renders its frames r, r + period, ..."""
+        per_period = leaf.reshape(count // period, -1, *leaf.shape[1:])
+        return per_period[:, max(distance - 1, 0)].reshape(count, *leaf.shape[2:])
+
+    phases = [
+        Phase(d, slice(d, d + count), jax.tree.map(partial(at, distance=d), rollout.aux[ESS if d else SS]))
+        for d in range(period)
+    ]
+    return Phases(phases, rollout.state, rollout.history)
+
+
+def every_phase(
+    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree], period: int = 2
+) -> tuple[list[Phase], PyTree]:
+    """Unroll ``clip`` in ``period`` runs side by side in one scan, each from a frame later; each begins with SS.
+
+    So frames are predicted in every phase: rendered, and extrapolated 1 ... period - 1 frames after the last rendered
+    one, each from the history that the schedule gives it at inference. As ESS, those closer to a cut are made of
+    nothing: see ``since_cut``.
+
+    Returns:
+      The phases, and the new statistics, see ``Rollout.state``.
+
+    Raises:
+      ValueError: the number of frames does not fit the period, see ``whole_periods``.
     """
     clip = _begun(clip)
-    return follow_both_kinds(method, variables, clip, keep, start_both_kinds(method, clip))[:2]
-
-
-def odd_length(clip: Sequence) -> Sequence:
-    """``clip`` without its last frame if their number is even: what ``both_kinds`` takes."""
-    length = clip.frames.motion.shape[0]
-    return clip if length % 2 else select_time(clip, slice(0, length - 1))
+    history = start_every_phase(method, clip, period)
+    return follow_every_phase(method, variables, clip, keep, history, period)[:2]
 
 
 def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Schedule | None = None) -> Prediction:
@@ -151,7 +213,7 @@ def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Sch
       method: the two steps.
       variables: its variables.
       frames: ``[T, ...]``, T >= 2.
-      schedule: of the clip; None: the alternation that extrapolates the last frame.
+      schedule: of the clip; None: every other frame is rendered, the last is extrapolated.
 
     Raises:
       ValueError: there are fewer than two frames.

@@ -55,7 +55,7 @@ def forwards(width: int, height: int) -> list[Forward]:
     extrass = _shape(*low, 31), _shape(*low, 37)
     fasset = (*(_shape(*low, n) for n in (3, 1, 7, PAST, 24)), _shape(*high, LOCAL), _shape(1, 2))
     features = _shape(*low, 4), _shape(*high, FEATURES), _shape(PREVIOUS, *high, FEATURES)
-    frnet = _shape(2, *half, 3), _shape(*half, 1)
+    frnet = _shape(2, *half, 3), _shape(*half, 1), _shape(2, 1)
     ifrnet = _shape(2, *low, 3), _shape(2, 1, 2)
     extranet = input_shapes(1, height=native["height"], width=native["width"])
     extrassnet = networks.extrassnet()

@@ -19,7 +19,7 @@ from experiments.benchmark.measure import Case, measure, summary
 from experiments.benchmark.suites import Options, Row
 from experiments.datasets import rendering_of
 from experiments.members import Member, resolve, settings_of
-from experiments.training import first_batch, initial_state, initial_variables, make_batches, make_step
+from experiments.training import first_batches, initial_state, initial_variables, make_batches, make_steps
 from experiments.variants import Stage
 
 FRAMES = (5, 9, 13)
@@ -65,7 +65,7 @@ def _case(name: str, stage: Stage, clip: Sequence) -> Case:
     length, batch, height, width = clip.frames.motion.shape[:4]
     variables = stage.method.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], clip.frames))
     transform = muon()
-    step = make_train_step(stage.objective, transform, stage.name)
+    step = make_train_step(next(iter(stage.tasks.values())).objective, transform, stage.name)
     # The state is donated inside; here it is an ordinary argument, so that a repetition starts where the last did.
     return Case(
         name,
@@ -110,15 +110,15 @@ def _loaded(*overrides: str) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         clips = plan("train", 1, data.train_frames, spp=1, families=["carousel"])
         dataset = generate(Path(folder), clips, *data.size, rendering=rendering_of(settings, ranges=False))
-        step = make_step(stage, settings)
+        steps = make_steps(stage, settings)
         variables = initial_variables(member, dataset)
-        state = initial_state(member, stage, variables, first_batch(dataset, settings, stage))
+        state = initial_state(member, stage, variables, first_batches(dataset, settings, stage))
         batches, waited, seconds = make_batches(dataset, settings, stage), [], []
         for n in range(LOADED_STEPS + 2):
             start = time.perf_counter()
-            batch = next(batches)
+            task, batch = next(batches)
             ready = time.perf_counter()
-            state, terms = step(state, batch, 1e-4)
+            state, terms = steps[task](state, batch, 1e-4)
             jax.device_get(terms)
             if n >= 2:
                 waited.append(ready - start)
