@@ -1,4 +1,4 @@
-"""Run methods over the test frames, twice with swapped parity, and score every frame as SS and as ESS (SPEC 0)."""
+"""Run methods over the test frames in every phase, and score every frame as SS and as ESS at each distance (SPEC 0)."""
 
 import collections.abc
 import dataclasses
@@ -19,7 +19,7 @@ from essjax.data.memory import Kept
 from essjax.exposure import clip_exposure
 from essjax.frames import Frame, Sequence, background, rendered_color
 from essjax.interfaces import Method, expand_flag
-from essjax.metrics import PHASES, aggregate, has_source, mean_over, psnr, score_rollout
+from essjax.metrics import aggregate, distances, has_source, mean_over, psnr, score_rollout
 from essjax.rollout import ESS, SS, Schedule, alternate, every, stream
 from essjax.typing import Array, PyTree
 from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
@@ -161,9 +161,14 @@ def batches(frames: Frame) -> Iterator[Frame]:
     return (jax.tree.map(lambda leaf, n=n: leaf[n, None], frames) for n in range(frames.motion.shape[0]))
 
 
-def schedules(method: Method) -> list[Schedule]:
-    """How a method is run: both parities, or every frame if it cannot extrapolate."""
-    return [every()] if method.info.renders_all else [alternate(0), alternate(1)]
+def schedules(method: Method, rate: int = 2) -> list[Schedule]:
+    """How a method is run, one frame in ``rate`` rendered: in every phase, or every frame if it cannot extrapolate."""
+    return [every()] if method.info.renders_all else [alternate(phase, period=rate) for phase in range(rate)]
+
+
+def runs_at(method: Method, rate: int, first: int) -> bool:
+    """Whether ``method`` is run at this rate: one that gets every frame once, at the ``first``; one that lags at 2."""
+    return rate == first if method.info.renders_all else rate == 2 or not method.info.latency
 
 
 @functools.partial(jax.jit, static_argnames="scale")
@@ -178,7 +183,9 @@ def _masked_psnr(images: Array, targets: Array, exposure: Array, mask: Array) ->
     return psnr(display(expose(images, exposure)), display(expose(targets, exposure)), mask=mask)
 
 
-def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str, ...]) -> list[dict[str, Any]]:
+def score_clip(
+    method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str, ...], rate: int = 2
+) -> list[dict[str, Any]]:
     """One row per scored frame of a kind that the method predicts; without those that it cannot show."""
     frames, scale = clip.sequence.frames, clip.sequence.scale
     low = images.shape[1:3] == frames.motion.shape[1:3] and not method.info.native
@@ -198,6 +205,7 @@ def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str,
         targets,
         scored=everything,
         kinds=kinds,
+        period=rate,
         exposure=clip.exposure,
         holes=holes,
         motion=motion,
@@ -208,10 +216,13 @@ def score_clip(method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str,
         at_samples = reference_at_samples(clip.sequence.reference, frames, scale)
         extra["psnr_reference"] = _masked_psnr(images, at_samples, clip.exposure, foreground)
     extra = {name: np.asarray(values) for name, values in extra.items()}
+    ages = distances(kinds)
     return [
         {
             "frame": clip.numbers[n],
             "resolution": "lr" if low else "hr",
+            "rate": rate,
+            "distance": int(ages[n]),
             **rows[n],
             **{name: float(values[n]) if np.isfinite(values[n]) else None for name, values in extra.items()},
         }
@@ -237,6 +248,7 @@ def evaluate(
     runners: Mapping[str, Runner],
     clips: collections.abc.Sequence[Clip],
     *,
+    rates: tuple[int, ...] = (2,),
     pictures: int = 1,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
@@ -245,36 +257,43 @@ def evaluate(
     Args:
       runners: method name -> runner, in the order of the table.
       clips: the test sequences; one is in use at a time.
+      rates: one frame in so many is rendered; rows, curves and pictures are of the first.
       pictures: chosen frames per sequence.
       on_step: called before each (method, sequence).
 
     Returns:
-      ``rows`` (per sequence and their mean, as metrics.json wants them), ``curves`` and ``pictures`` (as the report
+      ``rows`` (per sequence and their mean, as metrics.json wants them), ``rates`` (means per rate and distance to the
+      rendered frame, with the same labels and ``rate`` and ``distance``), ``curves`` and ``pictures`` (as the report
       wants them).
     """
-    curves: dict[str, dict[str, list]] = {name: {} for name in runners}
+    every_rate: dict[str, dict[str, list]] = {name: {} for name in runners}
     shown: dict[tuple, dict] = {}
 
     def run_method(name: str, clip: Clip) -> None:
         runner = runners[name]
         on_step(f"{name} on {clip.name}")
-        curves[name][clip.name] = []
-        for schedule in schedules(runner.method):
-            kinds = schedule.kinds(len(clip.numbers))
-            images = runner(clip.sequence, schedule)
-            curves[name][clip.name] += score_clip(runner.method, clip, images, kinds)
-            for n in picture_frames(clip, pictures):
-                with lock:
-                    if not has_image(clip, n, runner.method, kinds):
-                        continue
-                    _collect_picture(shown, clip, n, name, runner.method, images, kinds)
+        every_rate[name][clip.name] = []
+        for rate in rates:
+            for schedule in schedules(runner.method, rate) if runs_at(runner.method, rate, rates[0]) else ():
+                kinds = schedule.kinds(len(clip.numbers))
+                images = runner(clip.sequence, schedule)
+                every_rate[name][clip.name] += score_clip(runner.method, clip, images, kinds, rate)
+                for n in picture_frames(clip, pictures) if rate == rates[0] else ():
+                    with lock:
+                        if has_image(clip, n, runner.method, kinds) and distances(kinds)[n] in (0, rate - 1):
+                            _collect_picture(shown, clip, n, name, runner.method, images, kinds, rate)
 
     lock = threading.Lock()
     with ThreadPoolExecutor(2) as pool:  # most of the time is compilation, which two threads do side by side
         for index in range(len(clips)):  # not over the clips themselves: one would be held while the next is read
             list(pool.map(functools.partial(run_method, clip=clips[index]), runners))
+    curves = {
+        name: {clip: [row for row in rows if row["rate"] == rates[0]] for clip, rows in clips.items()}
+        for name, clips in every_rate.items()
+    }
     return {
         "rows": _summarise(curves),
+        "rates": _by_distance(every_rate),
         "curves": curves,
         "pictures": [_sorted_images(p, runners) for p in _ordered(shown)],
     }
@@ -289,7 +308,9 @@ def _sorted_images(picture: dict, names: Iterable[str]) -> dict:
     return {**picture, **parts}
 
 
-def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, images: np.ndarray, kinds) -> None:
+def _collect_picture(
+    shown, clip: Clip, n: int, name: str, method: Method, images: np.ndarray, kinds, rate: int
+) -> None:
     """Add a method's image of frame n to the pictures where it belongs (taau's and taa's to SS and ESS alike)."""
     low = images.shape[1:3] == clip.sequence.frames.motion.shape[1:3] and not method.info.native
     resolution = "lr" if low else "hr"
@@ -298,26 +319,26 @@ def _collect_picture(shown, clip: Clip, n: int, name: str, method: Method, image
             continue
         key = (clip.name, n, kind, resolution)
         if key not in shown:
-            shown[key] = _new_picture(clip, n, kind, low)
+            shown[key] = _new_picture(clip, n, kind, low, rate)
         # Copies: views would keep all frames of all clips in memory.
         shown[key]["images"][name] = images[n].copy()
         if shown[key]["previous"]:
-            shown[key]["previous"][name] = images[n - PHASES].copy()
+            shown[key]["previous"][name] = images[n - rate].copy()
 
 
-def _new_picture(clip: Clip, n: int, kind: str, low: bool) -> dict[str, Any]:
+def _new_picture(clip: Clip, n: int, kind: str, low: bool, rate: int) -> dict[str, Any]:
     frames, scale = clip.sequence.frames, 1 if low else clip.sequence.scale
     rendered = rendered_color(frames, "the report")
     target = rendered if low else clip.sequence.reference
-    # What was rendered last: this frame, or the one before where this one is extrapolated.
-    rendered_last = n if kind == SS else n - 1
-    frames_of_part = {"images": (n, rendered_last), "previous": (n - PHASES, rendered_last - PHASES)}
+    # What was rendered last: this frame, or one before where this one is extrapolated, the farthest that there is.
+    rendered_last = n if kind == SS else n - rate + 1
+    frames_of_part = {"images": (n, rendered_last), "previous": (n - rate, rendered_last - rate)}
     picture: dict[str, Any] = {
         "sequence": clip.name, "frame": clip.numbers[n], "kind": kind, "resolution": "lr" if low else "hr",
         "exposure": float(clip.exposure[n]),
     }  # fmt: skip
     starts = np.flatnonzero(np.asarray(clip.sequence.frames.cut)[: n + 1])
-    if rendered_last - PHASES < starts.max(initial=0):  # of another shot, or made of nothing
+    if rendered_last - rate < starts.max(initial=0):  # of another shot, or made of nothing
         picture["previous"] = {}
         del frames_of_part["previous"]
     for part, (frame, index) in frames_of_part.items():
@@ -345,6 +366,21 @@ def _summarise(curves: Mapping[str, Mapping[str, list]]) -> list[dict[str, Any]]
             rows += per_sequence
             if per_sequence:
                 rows.append(_row(method, "mean", kind, per_sequence))
+    return rows
+
+
+def _by_distance(curves: Mapping[str, Mapping[str, list]]) -> list[dict[str, Any]]:
+    """Means over frames, then over sequences, for each rate and distance to the rendered frame."""
+    rows = []
+    for method, sequences in curves.items():
+        found = {(entry["rate"], entry["distance"]) for entries in sequences.values() for entry in entries}
+        for rate, distance in sorted(found):
+            place, per_sequence = {"rate": rate, "distance": distance}, []
+            for sequence, entries in sequences.items():
+                chosen = [entry for entry in entries if (entry["rate"], entry["distance"]) == (rate, distance)]
+                if chosen:
+                    per_sequence.append(_row(method, sequence, chosen[0]["kind"], chosen))
+            rows.append({**_row(method, "mean", ESS if distance else SS, per_sequence), **place})
     return rows
 
 

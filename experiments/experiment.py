@@ -234,6 +234,7 @@ def _evaluate(run: Run, trained: Mapping[str, Trained], tuned: Tuned, phases: Ph
     images = evaluate(
         runners,
         clips,
+        rates=run.settings.evaluation.rates,
         pictures=run.settings.evaluation.pictures,
         on_step=lambda text: phases.show("evaluation", next(done) / (len(runners) * len(clips)), text),
     )
@@ -287,6 +288,7 @@ def _report(
         "warnings": health.few_steps(reports) + health.no_gain(reports),
         "costs": costs(tuned.runners, run.dataset),
         "rows": evaluated.images["rows"],
+        "rates": evaluated.images["rates"],
     }
     for name, found in evaluated.found.items():
         metrics.setdefault(VARIANTS[name].key, {})[name] = found.scores

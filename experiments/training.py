@@ -90,8 +90,9 @@ def check_batches(dataset: Dataset, settings: Settings, stage: Stage) -> None:
 def batch_lead(stage: Stage, task: Task, longest: int) -> tuple[int, int]:
     """Frames per clip and clips per batch, of sequences with ``longest`` frames at most.
 
-    The settings are for rate 1:2. At 1:k a clip has as many periods, rounded up, and where it is unrolled in every
-    phase a batch has fewer clips, so that the number of runs stays about the same.
+    The settings are for rate 1:2. Where a clip is unrolled in every phase of another, the runs are as long, rounded up
+    to whole periods, and a batch has fewer clips, so that the number of runs stays about the same. Else a clip has as
+    many periods.
 
     Raises:
       ValueError: no sequence is long enough.
@@ -99,7 +100,7 @@ def batch_lead(stage: Stage, task: Task, longest: int) -> tuple[int, int]:
     clip, batch, period = stage.settings.clip, stage.settings.batch, task.period
     if not task.recurrent:
         return min(-(-clip * period // 2), longest), batch
-    wanted = -(-(clip - 1) // 2) * period + period - 1
+    wanted = -(-(clip - 1) // period) * period + period - 1
     length = fitting_length(min(wanted, longest), period)
     if not length:
         raise ValueError(

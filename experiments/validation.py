@@ -1,5 +1,6 @@
 """Validation during training: a few frames of each held-out clip, played frame by frame as evaluation plays them."""
 
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -47,7 +48,7 @@ def _window(source: DiskSource, index: int, counted: np.ndarray, warmup: int) ->
 
 
 class Scorer:
-    """PSNR of a method on the windows, as evaluation has it: after x/(1+x) and sRGB, both kinds of frames."""
+    """PSNR of a method on the windows, as evaluation has it: after x/(1+x) and sRGB, both kinds, all trained rates."""
 
     def __init__(self, method: Method, dataset: Dataset, settings: Settings):
         """Nothing is read or compiled before the first score is asked for."""
@@ -62,9 +63,10 @@ class Scorer:
             self._windows = windows(self._dataset, self._settings, native=info.native)
             self._runner = Runner(self._method, variables, self._settings.compiler_options)
         self._runner.variables = variables
-        schedule = every() if info.renders_all else alternate(0)
+        rates = self._settings.training.rates
+        schedules = [every()] if info.renders_all else [alternate(period=rate) for rate in rates]
         values: dict[str, list[float]] = {}
-        for sequence, scored in self._windows:
+        for schedule, (sequence, scored) in itertools.product(schedules, self._windows):
             images = self._runner(sequence, schedule)
             low = images.shape[1:3] == sequence.frames.motion.shape[1:3] and not info.native
             targets = sequence.frames.color if low else sequence.reference

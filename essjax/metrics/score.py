@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,12 +25,10 @@ METRICS = (
 """Names of what ``score_rollout`` measures, in the order of the tables. ``ssim_dlctus`` has the constant C2 = 0.02^2 of
 thesis 002 (section 4.3.5) instead of 0.03^2; the last two are its spatio-temporal loss with theta 0 and 1."""
 
-PHASES = 2
-"""Frames from one to the one that temporal metrics compare it with. Where every other frame is rendered, it is of the
-same kind; where all are, it is two frames back as well, so that equal pictures score alike whatever the schedule. The
-frame just before is of the other kind in the first case (or, from a method that extrapolates nothing, a repetition)."""
 SAME_PHASE = ("tpsnr", "warped_error", "warped_error_reference")
-"""Metrics that look ``PHASES`` frames back."""
+"""Metrics that look ``period`` frames back. Where one frame in so many is rendered, that one was made alike; where all
+are, it is as far back as well, so that equal pictures score alike whatever the schedule. The frame just before is of
+another kind in the first case (or, from a method that extrapolates nothing, a repetition)."""
 CONSECUTIVE = ("spatial_error", "temporal_error")
 """Metrics of a frame and the one just before, as the thesis defines them: only where every frame is rendered."""
 MIN_HOLE_PIXELS = 16
@@ -42,6 +41,7 @@ def score_rollout(
     *,
     scored: Sequence[int],
     kinds: Sequence[str],
+    period: int = 2,
     exposure: Scalar | float | None = None,
     holes: Mask | None = None,
     motion: Motion | None = None,
@@ -52,8 +52,9 @@ def score_rollout(
     Args:
       images: ``[T, H, W, 3]`` linear HDR, what a method returned.
       targets: the same shape, what it should have returned.
-      scored: indices of the frames to score; the two frames before them are read for the temporal metrics.
+      scored: indices of the frames to score; the ``period`` frames before them are read for the temporal metrics.
       kinds: "ss" or "ess" for each of the T frames.
+      period: how many frames back temporal metrics look: one frame in so many is rendered.
       exposure: ``[T]`` or one number, what radiance is multiplied with before it is displayed, frames that are compared
         with frame n by that of frame n; None: ``exposure.clip_exposure`` of the targets, one number.
       holes: ``[T, H, W, 1]``, 1 on disoccluded pixels, at the images' resolution; without it ``psnr_holes`` and
@@ -64,7 +65,7 @@ def score_rollout(
 
     Returns:
       frame index -> ``{"kind": ..., metric: float or None}`` for every name in ``METRICS``: dB for the PSNRs, shares
-      and mean absolute differences in [0, 1] for the rest. Temporal metrics compare a frame with the one ``PHASES``
+      and mean absolute differences in [0, 1] for the rest. Temporal metrics compare a frame with the one ``period``
       before it (those in ``CONSECUTIVE`` with the one just before). None where a metric does not exist (no such frame
       in the shot, or one of another kind; fewer than ``MIN_HOLE_PIXELS`` pixels are holes) or is not finite;
       ``"non_finite"`` is 1 where image or target, of this frame or of those that it is compared with, hold NaN or
@@ -92,13 +93,14 @@ def score_rollout(
     now = np.asarray(scored)
     since_cut = _frames_since_cut(length, cuts)
     made = has_source(kinds, np.zeros(length, bool) if cuts is None else cuts)
-    alike = np.array([since_cut[n] >= PHASES and kinds[n] == kinds[n - PHASES] and made[n - PHASES] for n in scored])
+    ages = distances(kinds)
+    alike = np.array([since_cut[n] >= period and ages[n] == ages[n - period] and made[n - period] for n in scored])
     consecutive = (since_cut[now] >= 1) & ("ess" not in kinds)
     # Where there is nothing to compare with: the frame itself, whose values are dropped below.
-    before, like = np.where(consecutive, now - 1, now), np.where(alike, now - PHASES, now)
+    before, like = np.where(consecutive, now - 1, now), np.where(alike, now - period, now)
     shown = np.broadcast_to(clip_exposure(targets) if exposure is None else np.asarray(exposure), length)
     places = np.stack([now, before, like], axis=-1)
-    measured = _score_frames(images, targets, jnp.asarray(shown, jnp.float32), holes, motion, places)
+    measured = _score_frames(images, targets, jnp.asarray(shown, jnp.float32), holes, motion, places, period)
     columns = {name: np.asarray(values) for name, values in measured.items()}
     rows = {}
     for k, n in enumerate(scored):
@@ -117,10 +119,17 @@ def has_source(kinds: Sequence[str], cuts: Sequence[bool] | np.ndarray) -> np.nd
       kinds: "ss" or "ess" for each frame.
       cuts: for each frame, whether a shot starts there; one does at frame 0.
     """
-    rendered = np.asarray(kinds) == "ss"
-    number = np.arange(len(rendered))
-    latest = np.maximum.accumulate(np.where(rendered, number, -1))
-    return latest >= number - _frames_since_cut(len(rendered), cuts)
+    return distances(kinds) <= _frames_since_cut(len(kinds), cuts)
+
+
+def distances(kinds: Sequence[str]) -> np.ndarray:
+    """Count how many frames ago the latest rendered one was, int ``[T]``: 0 of one that is rendered itself.
+
+    Args:
+      kinds: "ss" or "ess" for each frame; before the first "ss", the distance is that to frame -1.
+    """
+    number = np.arange(len(kinds))
+    return number - np.maximum.accumulate(np.where(np.asarray(kinds) == "ss", number, -1))
 
 
 def _frames_since_cut(length: int, cuts: Sequence[bool] | np.ndarray | None) -> np.ndarray:
@@ -130,7 +139,7 @@ def _frames_since_cut(length: int, cuts: Sequence[bool] | np.ndarray | None) -> 
     return np.arange(length) - np.maximum.accumulate(np.where(starts, np.arange(length), 0))
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="period")
 def _score_frames(
     images: Color,
     targets: Color,
@@ -138,9 +147,10 @@ def _score_frames(
     holes: Mask | None,
     motion: Motion | None,
     places: Int[Array, "N 3"],
+    period: int,
 ) -> dict[str, Array]:
     """Frame by frame (``lax.map``), so that memory does not grow with the length of the sequence."""
-    return jax.lax.map(lambda place: _score_frame(images, targets, exposure, holes, motion, place), places)
+    return jax.lax.map(lambda place: _score_frame(images, targets, exposure, holes, motion, place, period), places)
 
 
 def _score_frame(
@@ -150,6 +160,7 @@ def _score_frame(
     holes: Mask | None,
     motion: Motion | None,
     place: Int[Array, "3"],
+    period: int,
 ) -> dict[str, Array]:
     """Metrics of a frame; ``place`` is its index, that of the one just before and that of the one of its phase."""
     pictures = images[place], targets[place]
@@ -162,21 +173,30 @@ def _score_frame(
         "ssim_dlctus": ssim(image, target, c2=0.02**2),
         "tpsnr": tpsnr(image, image_like, target, target_like),
     }
-    valid = None
     if holes is not None:
-        hole, valid = holes[place[0]], 1.0 - holes[jnp.maximum(place[0] - 1, 0)]
+        hole = holes[place[0]]
         enough = jnp.sum(hole) >= MIN_HOLE_PIXELS
         result["psnr_holes"] = jnp.where(enough, psnr(image, target, mask=hole), jnp.nan)
         result["hole_share"] = jnp.mean(hole)
     if motion is not None:
         last = motion[place[0]]
-        path, known = compose_motion(last, motion[jnp.maximum(place[0] - 1, 0)], valid_previous=valid)
-        valid = None if holes is None else known * (1.0 - hole)
+        path, valid = _path(motion, holes, place[0], period)
         result["warped_error"] = warped_error(image, image_like, path, valid=valid)
         result["warped_error_reference"] = warped_error(target, target_like, path, valid=valid)
         for name, theta in (("spatial_error", 0.0), ("temporal_error", 1.0)):
             result[name] = spatio_temporal_error(image, image_before, target, target_before, last, theta=theta)
     return result
+
+
+def _path(motion: Motion, holes: Mask | None, now: Array, period: int) -> tuple[Motion, Mask | None]:
+    """Motion from frame ``now`` to the one ``period`` before it, and where no hole is on the way (None: not known)."""
+    before = jnp.maximum(now - period + 1, 0)
+    path, valid = motion[before], None if holes is None else 1.0 - holes[before]
+    for back in range(period - 2, -1, -1):
+        frame = jnp.maximum(now - back, 0)
+        path, known = compose_motion(motion[frame], path, valid_previous=valid)
+        valid = None if holes is None else known * (1.0 - holes[frame])
+    return path, valid
 
 
 def _number(value: np.ndarray) -> float | None:

@@ -15,9 +15,11 @@ from experiments.report.pictures import Picture, make_picture
 from experiments.report.rows import (
     COLUMNS,
     KIND_NAMES,
+    RateTable,
     Table,
     headline,
     make_table,
+    rate_tables,
     resolutions,
     sequences,
 )
@@ -148,7 +150,9 @@ def _page(
         "facts": "".join(_fact(name, value) for name, value in _facts(metrics)),
         "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
         "sequences": "".join(options),
-        "tables": "\n".join(_table(table) for table in tables if table.lines),
+        "tables": "\n".join(
+            [*(_table(table) for table in tables if table.lines), *(_rates(table) for table in rate_tables(metrics))]
+        ),
         "help": "".join(help_lines),
         "learning": learning_section(training),
         "costs": _costs(metrics.get("costs") or {}),
@@ -215,6 +219,18 @@ def _table(table: Table) -> str:
         f"<figcaption>{table.title}</figcaption><div><table><thead>"
         f'<tr><th rowspan="2" scope="col">method</th>{groups}</tr><tr>{labels}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div></figure>"
+    )
+
+
+def _rates(table: RateTable) -> str:
+    heads = "".join(f'<th scope="col">{head}</th>' for head in table.heads)
+    body = "".join(
+        f'<tr><th scope="row">{html.escape(method)}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
+        for method, cells in table.lines.items()
+    )
+    return (
+        f'<figure class="scores"><figcaption>{table.title}</figcaption><div><table><thead>'
+        f'<tr><th scope="col">method</th>{heads}</tr></thead><tbody>{body}</tbody></table></div></figure>'
     )
 
 

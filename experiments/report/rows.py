@@ -138,6 +138,41 @@ def make_table(
     return Table(RESOLUTION_NAMES[resolution] + holes, sequence, kinds, lines)
 
 
+class RateTable(NamedTuple):
+    """PSNR by rate and distance to the rendered frame: heads of the columns, method -> its cells."""
+
+    title: str
+    heads: list[str]
+    lines: dict[str, list[str]]
+
+
+def rate_tables(metrics: Mapping[str, Any]) -> list[RateTable]:
+    """Make a table of each resolution; none where frames were rendered at 1:2 alone, for that the others show."""
+    rows = metrics.get("rates") or []
+    if {row["rate"] for row in rows} <= {2}:
+        return []
+    tables = []
+    for resolution in resolutions({"rows": rows}):
+        found = {
+            (row["method"], row["rate"], row["distance"]): row["psnr"]
+            for row in rows
+            if row["resolution"] == resolution and row.get("psnr") is not None
+        }
+        places = sorted({key[1:] for key in found})
+        methods = dict.fromkeys(key[0] for key in found)
+        tables.append(
+            RateTable(
+                f"PSNR (dB) by rate and frames since the rendered one, {resolution.upper()}",
+                [f"1:{rate} {f'+{distance}' if distance else 'SS'}" for rate, distance in places],
+                {
+                    method: [f"{found[method, *place]:.2f}" if (method, *place) in found else "–" for place in places]
+                    for method in methods
+                },
+            )
+        )
+    return tables
+
+
 def _quality(rows: Mapping[tuple[str, str], Mapping[str, Any]], method: str, kinds: list[str]) -> float:
     """Return what methods are sorted by."""
     for kind in reversed(kinds):

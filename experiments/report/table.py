@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.report.rows import COLUMNS, Table, headline, make_table, resolutions
+from experiments.report.rows import COLUMNS, Table, headline, make_table, rate_tables, resolutions
 
 
 def print_table(
@@ -41,6 +41,15 @@ def print_table(
         for line in table.lines:
             if line.remark:
                 console.print(f"* {line.method}: {line.remark}", style="dim", highlight=False)
+    for rates in rate_tables(metrics):
+        grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False)
+        grid.add_column("method", no_wrap=True)
+        for head in rates.heads:
+            grid.add_column(head.replace(" ", "\n"), justify="right", no_wrap=True)
+        for method, cells in rates.lines.items():
+            grid.add_row(method, *cells)
+        console.print(rates.title, style="bold", highlight=False)
+        console.print(grid)
     console.print(headline(metrics, references), highlight=False)
 
 

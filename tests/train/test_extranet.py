@@ -85,7 +85,7 @@ def test_terms_equal_numpy():
 
 
 def test_at_one_in_three_both_distances_count():
-    """The mean over frames that are one and two frames away from the last rendered one, seen from the kinds of steps."""
+    """The mean over the frame as it is extrapolated one and two frames after the last rendered one."""
     seen = []
 
     def listen(step, kind):
