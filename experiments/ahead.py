@@ -12,7 +12,7 @@ from essjax.typing import Array
 from experiments.datasets import rendering_of
 from experiments.members import Member
 from experiments.settings import Settings
-from experiments.training import batch_lead, check_crop, initial_state, make_steps
+from experiments.training import batch_lead, check_crop, initial_state, lacking, make_steps
 from experiments.variants import Stage
 
 
@@ -22,8 +22,11 @@ def batch_shapes(settings: Settings, stage: Stage) -> dict[str, Sequence]:
     clip = Clip("train", "carousel", 0, frames=1, spp=1)
     one = live_source([clip], width, height, rendering=rendering_of(settings, ranges=stage.ranges))[0]
     leads = {name: batch_lead(stage, task, settings.data.train_frames) for name, task in stage.tasks.items()}
+    clips = {name: lacking(task.without, one) for name, task in stage.tasks.items()}
     return {
-        name: jax.tree.map(lambda leaf, lead=lead: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), leaf.dtype), one)
+        name: jax.tree.map(
+            lambda leaf, lead=lead: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), leaf.dtype), clips[name]
+        )
         for name, lead in leads.items()
     }
 

@@ -47,14 +47,16 @@ class Data:
 class Training:
     """Settings that all stages share.
 
-    rates: one frame in so many is rendered, [2] as in the papers; of several, batches of each take turns. optimizer: of
-    ``essjax.train.OPTIMIZERS``. anneal: the learning rates decay. save_every: seconds between
+    rates: one frame in so many is rendered, [2] as in the papers; of several, batches of each take turns. without:
+    G-buffers that batches lack, in turn: ["", "base_color", "base_color+normal"] drops none in one of three.
+    optimizer: of ``essjax.train.OPTIMIZERS``. anneal: the learning rates decay. save_every: seconds between
     checkpoints. average: decay of a moving average of the weights over the steps; None: the last weights. validations:
     how often after the start of each stage, equally apart in its budget, the averaged weights play a few frames of each
     validation clip: the best are kept; None: never, the last are. vgg: path of VGG-16 weights.
     """
 
     rates: tuple[int, ...]
+    without: tuple[str, ...]
     optimizer: Literal["muon", "adam"]
     anneal: bool
     save_every: float
@@ -134,6 +136,7 @@ COMMON: Table = {
     "data.jitter":               ("kronecker",) * 3,
     "data.fresh":                (None,     None,     None),
     "training.rates":            ((2,),     (2,),     (2,)),
+    "training.without":          (("",),    ("",),    ("",)),
     "training.optimizer":        ("muon",   "muon",   "adam"),
     "training.anneal":           (True,     True,     True),
     "training.save_every":       (30.0,     30.0,     300.0),

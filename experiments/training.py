@@ -1,6 +1,7 @@
 """Train a variant: its stages in order, each resumable from its newest checkpoint."""
 
 import contextlib
+import dataclasses
 import functools
 import itertools
 import json
@@ -16,7 +17,7 @@ import numpy as np
 from essjax.builtin import RENDERER, live_source
 from essjax.data import CachedSource, Mixed, Rounds, Source, clips, disk_source, successive_clips
 from essjax.data.layout import Dataset
-from essjax.frames import Sequence, select_time
+from essjax.frames import Sequence, select_time, without_buffers
 from essjax.train import (
     OPTIMIZERS,
     Checkpoints,
@@ -116,7 +117,13 @@ def _clips(source: Source, dataset: Dataset, stage: Stage, task: Task, **options
     longest = max(len(dataset.numbers(segment)) for segment in dataset.segments("train"))
     length, batch = batch_lead(stage, task, longest)
     options |= {"length": length, "batch": batch, "crop": (height, width)}
-    return successive_clips(source, overlap=task.period - 1, **options) if task.recurrent else clips(source, **options)
+    found = successive_clips(source, overlap=task.period - 1, **options) if task.recurrent else clips(source, **options)
+    return found.map(functools.partial(lacking, task.without)) if task.without else found
+
+
+def lacking(names: tuple[str, ...], clip: Sequence) -> Sequence:
+    """``clip`` without those G-buffers."""
+    return dataclasses.replace(clip, frames=without_buffers(clip.frames, names))
 
 
 def make_batches(dataset: Dataset, settings: Settings, stage: Stage, *, prefetch: int = 4):

@@ -4,6 +4,7 @@ Pipeline: extrapolation at low resolution (``extrass_low``, sections 4.2 and 4.3
 """
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +17,12 @@ from essjax.frames import (
     Prediction,
     depth_scale,
     network_depth,
-    require,
-    surface_guides,
     without_color,
 )
 from essjax.interfaces import Method, MethodInfo, Parted, Parts, from_parts, reset_at_cut
 from essjax.methods.extrass_low import Extrapolated, extrapolate, frnet_inputs
 from essjax.methods.registry import registered
 from essjax.methods.rendered import (
-    GUIDED,
     Memory,
     Rendered,
     advance,
@@ -102,6 +100,7 @@ class Seen:
       low: inputs of E0 or E1 that are LR, ``[..., H, W, C]``.
       current: the LR colour (log1p) resampled to the HR grid.
       prior: logit of its share before training, ``[..., sH, sW, 1]``.
+      conditions: see ``conditions_of``.
       extrapolated: where that colour comes from if the frame is not rendered.
     """
 
@@ -113,6 +112,7 @@ class Seen:
     low: Image
     current: Resampled
     prior: Array
+    conditions: Array
     extrapolated: Extrapolated | None
 
 
@@ -149,6 +149,23 @@ def warp_shown(image: Color, motion: Motion) -> Color:
     """Warp the last output, linear, along ``motion``; return log1p."""
     # Bicubic: bilinear would blur the history a little more with every frame. Of x / (1 + x): bright pixels would ring.
     return log1p_of_reinhard(backward_warp(reinhard(image), motion, mode="bicubic"))
+
+
+def conditions_of(frame: Frame, age: Array | None, scale: int) -> Array:
+    """Say how a frame differs from the paper's setting, ``[..., CONDITIONS]``; 0 where it does not.
+
+    No base colour, no normals, how many frames more than one the last rendered one is away (over 2), the logarithm of
+    output size over twice the input size.
+
+    Args:
+      frame: its buffers.
+      age: of the last rendered frame, ``[...]``; None for a rendered frame.
+      scale: output size over input size.
+    """
+    like = jnp.zeros(frame.cut.shape, jnp.float32)
+    absent = [like + float(image is None) for image in (frame.gbuffers.base_color, frame.gbuffers.normal)]
+    farther = like if age is None else (jnp.clip(age, 1.0, 8.0) - 1.0) / 2.0
+    return jnp.stack([*absent, farther, like + math.log2(scale / 2)], axis=-1)
 
 
 def _mean_of_nine(mask: Mask) -> Mask:
@@ -230,18 +247,18 @@ def extrass(
         return Parted(memory=past, shown=image)
 
     def init(key, example):
-        require(example, sorted(GUIDED), info.name)
         key_flow, key_net = jax.random.split(key)
         flow = flow_network.init(key_flow, *frnet_inputs(example))
 
         def inputs(flow, frame):
             history = start(frame)
             seen = observe({"frnet": flow}, remember(history.memory, frame)[1], frame)
-            return _inputs(seen, history.shown)
+            return _inputs(seen, history.shown), seen.conditions
 
         rendered = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
         kinds = [jax.eval_shape(inputs, flow, frame) for frame in (rendered, without_color(example))]
-        return {"frnet": flow, "extrassnet": network.init(key_net, *kinds)}  # only shapes matter
+        (ss, conditions), (ess, _) = kinds
+        return {"frnet": flow, "extrassnet": network.init(key_net, ss, ess, conditions)}  # only shapes matter
 
     def remember(past: Past, frame: Frame) -> tuple[Past, Notes]:
         pair = advance(reset_pair(frame, past.rendered), frame)
@@ -267,7 +284,9 @@ def extrass(
         if notes.rendered is not None:
             pair = jax.tree.map(lambda *frames: jnp.stack(frames), *notes.rendered)
             extrapolated = extrapolate(flow_network, variables["frnet"], pair, notes.count, frame, sigmas)
-            color, extra = extrapolated.image, [log1p(extrapolated.warp), surface_guides(frame.gbuffers)[0]]
+            base = frame.gbuffers.base_color
+            color = extrapolated.image
+            extra = [log1p(extrapolated.warp), jnp.zeros_like(color) if base is None else base]
         assert color is not None
         encoded = log1p(color)
         current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), scale)
@@ -286,6 +305,7 @@ def extrass(
             low=jnp.concatenate(low, axis=-1),
             current=current,
             prior=_prior(valid, weight),
+            conditions=conditions_of(frame, None if notes.rendered is None else notes.rendered[0].age, scale),
             extrapolated=extrapolated,
         )
 
@@ -298,7 +318,8 @@ def extrass(
         log_warped = fade(warp_shown(image, seen.motion), seen.current.color, seen.reactive, seen.cut)
         encode = "render" if seen.extrapolated is None else "extrapolate"
         inputs = _inputs(seen, log_warped)
-        (head, features), _ = network.apply(variables["extrassnet"], inputs, train=train, method=encode)
+        given = inputs, seen.conditions
+        (head, features), _ = network.apply(variables["extrassnet"], *given, train=train, method=encode)
         log_image = _compose(head, log_warped, seen, scale)
         warped = Warped(log_image=log_warped, valid=seen.valid, valid_low=seen.valid_low)
         aux = {"log_image": log_image, "warped": warped, "features": features}
@@ -310,6 +331,6 @@ def extrass(
     def map_memory(function, past: Past) -> Past:
         return dataclasses.replace(past, rendered=map_shading(function, past.rendered))
 
-    info = MethodInfo("extrass", scale=scale, requires=GUIDED)
+    info = MethodInfo("extrass", scale=scale)
     method = from_parts(init, start, Parts(remember, observe, show), info)
     return within_shots(exposed_parts(method, map_memory, lambda function, image: function(image)))

@@ -27,7 +27,6 @@ from essjax.frames import (
 from essjax.interfaces import Method, MethodInfo, reset_at_cut
 from essjax.methods.registry import registered
 from essjax.methods.rendered import (
-    GUIDED,
     Memory,
     Rendered,
     advance,
@@ -53,6 +52,7 @@ from essjax.warp import (
     upsample_motion,
 )
 
+REQUIRES = frozenset({"base_color", "normal"})
 SAMPLE_SIGMA = 0.65
 """Sigma of the Gaussian that tells RenderINR how near a sample is, output pixels."""
 
@@ -269,7 +269,7 @@ def fasset(
         return _start(example, scale, width)
 
     def init(key, example):
-        require(example, sorted(GUIDED), name)
+        require(example, sorted(REQUIRES), name)
         *lead, height, low_width, _ = example.motion.shape
         large = (*lead, round(scale * height), round(scale * low_width), LOCAL)
         low = [(*lead, height, low_width, channels) for channels in (3, 1, 7, PAST, width)]
@@ -322,7 +322,7 @@ def fasset(
         scaled = lambda kept: dataclasses.replace(kept, **{name: function(getattr(kept, name)) for name in names})  # noqa: E731
         return dataclasses.replace(history, rendered=map_content(scaled, history.rendered))
 
-    info = MethodInfo(name, scale=scale, requires=GUIDED)
+    info = MethodInfo(name, scale=scale, requires=REQUIRES)
     return within_shots(exposed(Method(init, start, render_step, extrapolate_step, info), map_radiance))
 
 

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 
 from essjax.color import expm1, log1p, sum_channels
 from essjax.exposure import exposed
-from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require, select_time, surface_guides
+from essjax.frames import Frame, GBuffers, Prediction, rendered_color, select_time
 from essjax.interfaces import Method, MethodInfo, Network, no_variables
 from essjax.methods.registry import registered
 from essjax.methods.rendered import (
-    GUIDED,
     Memory,
     Rendered,
     advance,
@@ -26,7 +25,7 @@ from essjax.methods.shots import within_shots
 from essjax.networks import frnet
 from essjax.networks.blocks import crop, mean_pool, nearest_upsample, pad_to_multiple
 from essjax.typing import Array, Color, Image, Mask, PyTree, Resized, pytree
-from essjax.warp import backward_warp
+from essjax.warp import backward_warp, normals_from_depth
 from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
 
 RATIO_FLOOR = 0.02
@@ -55,7 +54,7 @@ def extrass_w(
         image = guided_extrapolation(newest, history.count, frame, **sigmas)
         return history, Prediction(image=image, aux={"warp": image})
 
-    info = MethodInfo("extrass-w", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
+    info = MethodInfo("extrass-w", scale=1, predicts=frozenset({"ess"}))
     return within_shots(exposed(Method(no_variables, start_pair, render_step, extrapolate_step, info), map_shading))
 
 
@@ -99,10 +98,12 @@ def _length(vectors: Array) -> Array:
 
 
 def blend_mask(refined: Resized, warped: Color, gbuffers: GBuffers, *, delta: float = REFINE_DELTA) -> Mask:
-    """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear)."""
-    base, normal = surface_guides(gbuffers)
-    base_half, normal_half = _enlarge(halve(base), base), _enlarge(halve(normal), normal)
-    distance = _length(base_half - base) / 3.0**0.5
+    """m̂ of eq 6: 1 where FRNet's half-size ``refined`` replaces ``warped`` (both linear); base colour may be absent."""
+    normal = normals_from_depth(gbuffers.depth) if gbuffers.normal is None else gbuffers.normal
+    base, distance = gbuffers.base_color, 0.0
+    if base is not None:
+        distance = _length(_enlarge(halve(base), base) - base) / 3.0**0.5
+    normal_half = _enlarge(halve(normal), normal)
     similar = (1.0 - distance) * sum_channels(normal_half * normal) > delta
     large = _enlarge(refined, warped)
     norm = jnp.maximum(_length(large), 1e-3)
@@ -178,7 +179,6 @@ def extrass_e(
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
     def init(key, example):
-        require(example, sorted(GUIDED), info.name)
         return {"frnet": network.init(key, *frnet_inputs(example))}
 
     def render_step(variables, history, frame, *, train=False):
@@ -189,6 +189,6 @@ def extrass_e(
         result = extrapolate(network, variables["frnet"], history.frames, history.count, frame, sigmas)
         return history, Prediction(image=result.image, aux={"extrapolated": result})
 
-    info = MethodInfo("extrass-e", scale=1, requires=GUIDED, predicts=frozenset({"ess"}))
+    info = MethodInfo("extrass-e", scale=1, predicts=frozenset({"ess"}))
     method = Method(init, start_pair, render_step, extrapolate_step, info, networks=(("frnet", network),))
     return within_shots(exposed(method, map_shading))

@@ -9,14 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from essjax.color import demodulate, demodulation_albedo, modulate, reinhard, reinhard_inverse
-from essjax.frames import Frame, GBuffers, background, rendered_color, surface_guides
+from essjax.frames import Frame, GBuffers, background, rendered_color
 from essjax.interfaces import expand_flag, reset_at_cut
 from essjax.methods.shots import check_masks, path_trust
 from essjax.typing import Array, Callable, Color, Flag, Image, Jitter, Mask, Motion, PyTree, pytree
 from essjax.warp import compose_motion, gbuffer_guided_warp, guides, jittered_motion
-
-GUIDED = frozenset({"base_color", "normal"})
-"""``MethodInfo.requires`` of every method that warps guided by G-buffers."""
 
 
 @pytree
@@ -137,8 +134,10 @@ def map_shading(function: Callable[[Array], Array], memory: Memory) -> Memory:
 
 
 def albedo(gbuffers: GBuffers) -> Color:
-    """Return the demodulation divisor of these G-buffers."""
-    base_color, _ = surface_guides(gbuffers)
+    """Return the demodulation divisor of these G-buffers; ones where base colour is absent."""
+    base_color = gbuffers.base_color
+    if base_color is None:
+        return jnp.ones((*gbuffers.depth.shape[:-1], 3), jnp.float32)
     return demodulation_albedo(base_color, background(gbuffers), gbuffers.metallic, gbuffers.specular)
 
 
@@ -147,8 +146,8 @@ class Shading:
     """All that guided warps keep of a rendered frame.
 
     Attributes:
-      shading: demodulated colour ``[..., H, W, 3]``.
-      guide: base colour and normal ``[..., H, W, 6]``.
+      shading: demodulated colour ``[..., H, W, 3]``; colour where there is no base colour.
+      guide: ``warp.guides`` ``[..., H, W, 6]``.
     """
 
     shading: Color
@@ -190,8 +189,8 @@ def guided_extrapolation(
 ) -> Color:
     """f_g: rendered frames warped to ``frame``'s samples, ``[2, ..., H, W, 3]`` (or without that axis; eq 1-3).
 
-    Shading is warped and modulated with the *current* base colour (section 4.2); the warp blends x / (1 + x), so that
-    of four candidates a bright one does not rule. Black where nothing was rendered yet.
+    Shading is warped and modulated with the *current* base colour (section 4.2); without one, colour is warped. Warps
+    blend x / (1 + x), so that of four candidates a bright one does not rule. Black where nothing was rendered yet.
 
     Args:
       rendered: one frame or more of a ``Memory``.

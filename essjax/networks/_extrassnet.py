@@ -12,11 +12,16 @@ import jax.numpy as jnp
 from essjax.interfaces import Network
 from essjax.networks.blocks import ConvBlock, conv, crop, mean_pool, nearest_upsample, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen
-from essjax.typing import Callable, Image
+from essjax.typing import Array, Callable, Image
 
 LEVELS = 4
 HEAD = 5
 """Outputs per HR pixel: blending logit, clamping logit, residual RGB."""
+
+
+CONDITIONS = 4
+"""Numbers that say how a frame differs from the paper's setting, see ``methods``; a network that never saw other than
+zeros does not depend on them."""
 
 
 class Encoder(nn.Module):
@@ -25,11 +30,13 @@ class Encoder(nn.Module):
     widths: tuple[int, ...]
 
     @nn.compact
-    def __call__(self, x: Image) -> list[Image]:
-        """Encode ``[B, H, W, C]``; both sizes must be multiples of 8."""
+    def __call__(self, x: Image, conditions: Array) -> list[Image]:
+        """Encode ``[B, H, W, C]`` under ``conditions`` ``[B, CONDITIONS]``; both sizes must be multiples of 8."""
         features = []
         for level, width in enumerate(self.widths):
             x = ConvBlock(width)(mean_pool(x) if level else x)
+            shift = nn.Dense(width, use_bias=False, kernel_init=nn.initializers.zeros, name=f"conditions_{level}")
+            x = x + shift(conditions)[..., None, None, :].astype(x.dtype)
             features.append(x)
         return features
 
@@ -76,22 +83,22 @@ class ExtraSSNet(nn.Module):
         self.encoder_ess = Encoder(widths)
         self.decoder = Decoder(widths, HEAD * self.scale**2)
 
-    def _run(self, encoder: Encoder, inputs: Image) -> tuple[Image, list[Image]]:
+    def _run(self, encoder: Encoder, inputs: Image, conditions: Array) -> tuple[Image, list[Image]]:
         height, width = inputs.shape[-3:-1]
-        features = encoder(pad_to_multiple(inputs, 2 ** (LEVELS - 1)))
+        features = encoder(pad_to_multiple(inputs, 2 ** (LEVELS - 1)), conditions)
         return crop(self.decoder(features), height, width), features
 
-    def render(self, inputs: Image, train: bool = False) -> tuple[Image, list[Image]]:
+    def render(self, inputs: Image, conditions: Array, train: bool = False) -> tuple[Image, list[Image]]:
         """SS: ``(head [B, H, W, HEAD * scale^2], features of 4 levels)`` from E0's inputs."""
-        return self._run(self.encoder_ss, inputs)
+        return self._run(self.encoder_ss, inputs, conditions)
 
-    def extrapolate(self, inputs: Image, train: bool = False) -> tuple[Image, list[Image]]:
+    def extrapolate(self, inputs: Image, conditions: Array, train: bool = False) -> tuple[Image, list[Image]]:
         """ESS: the same from E1's inputs."""
-        return self._run(self.encoder_ess, inputs)
+        return self._run(self.encoder_ess, inputs, conditions)
 
-    def __call__(self, inputs_ss: Image, inputs_ess: Image, train: bool = False):
+    def __call__(self, inputs_ss: Image, inputs_ess: Image, conditions: Array, train: bool = False):
         """Both paths: what ``init`` needs to make all parameters."""
-        return self.render(inputs_ss), self.extrapolate(inputs_ess)
+        return self.render(inputs_ss, conditions), self.extrapolate(inputs_ess, conditions)
 
 
 def extrassnet(width: int = 24, scale: int = 2) -> Network:

@@ -7,6 +7,7 @@ centres lie at +0.5. All functions may be jitted, vmapped and differentiated.
 from essjax.warp._splat import splat, splat_nearest
 from essjax.warp.backward import backward_warp
 from essjax.warp.candidates import candidate_offsets
+from essjax.warp.depth_guides import depth_guide, normals_from_depth
 from essjax.warp.fetches import sample_by_fetches
 from essjax.warp.fill import fill_holes
 from essjax.warp.gbuffer_guided import gbuffer_guided_warp, guided_weights, guides
@@ -23,9 +24,10 @@ from essjax.warp.upsample import (
 )
 
 __all__ = [
-    "Resampled", "backward_warp", "candidate_offsets", "compose_motion", "depth_to_space", "dilate_motion",
-    "fill_holes", "gaussian_resample", "gbuffer_guided_warp", "guided_weights", "guides", "hole_mask", "inside_mask",
-    "jitter_aligned_upsample", "jittered_motion", "occlusion_motion", "sample", "sample_by_fetches",
+    "Resampled", "backward_warp", "candidate_offsets", "compose_motion", "depth_guide", "depth_to_space",
+    "dilate_motion", "fill_holes", "gaussian_resample", "gbuffer_guided_warp", "guided_weights", "guides", "hole_mask",
+    "inside_mask", "jitter_aligned_upsample", "jittered_motion", "normals_from_depth", "occlusion_motion", "sample",
+    "sample_by_fetches",
     "sample_zero_upsampled", "space_to_depth", "splat", "splat_motion", "splat_nearest", "tent_resample",
     "upsample_motion", "zero_upsample",
 ]  # fmt: skip

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from essjax import kernels
-from essjax.frames import GBuffers, surface_guides
+from essjax.frames import GBuffers
 from essjax.typing import Array, Guide, Image, Motion
 from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.candidates import BORDER, FAR, LEAST, LIMIT, MARGIN, REACH, UNUSABLE, candidate_offsets
+from essjax.warp.depth_guides import depth_guide, normals_from_depth
 from essjax.warp.sampling import gather_pixels
 
 WINNERS = 4
@@ -34,8 +35,13 @@ IMPLEMENTATIONS = ("auto", *SELECTIONS, "triton")
 
 
 def guides(gbuffers: GBuffers) -> Guide:
-    """Make the guide of eq 2: base colour and normal, ``[..., H, W, 6]``."""
-    return jnp.concatenate(surface_guides(gbuffers), axis=-1)
+    """Make the guide of eq 2: base colour and normal, ``[..., H, W, 6]``.
+
+    Where they are absent depth stands in: its logarithm for base colour, normals that are estimated from it.
+    """
+    base = depth_guide(gbuffers.depth) if gbuffers.base_color is None else gbuffers.base_color
+    normal = normals_from_depth(gbuffers.depth) if gbuffers.normal is None else gbuffers.normal
+    return jnp.concatenate([base, normal], axis=-1)
 
 
 def _smaller(a: Array, b: Array) -> Array:

@@ -1,11 +1,13 @@
 """Variants: a method with its training, and what ``docs/methods.md`` says about it."""
 
 import dataclasses
+import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from essjax.buffers import OPTIONAL_GBUFFERS
 from essjax.interfaces import Method
 from essjax.train import Budget, Objective, Recurrent, constant, cosine
 from experiments.settings import Settings, StageSettings, Table, arguments, make_settings
@@ -16,11 +18,13 @@ class Task(NamedTuple):
 
     Attributes:
       objective: what is minimised.
-      period: one frame in so many is rendered; 1 where all are.
+      period: one frame in so many is rendered.
+      without: optional buffers that its frames lack.
     """
 
     objective: Objective | Recurrent
-    period: int
+    period: int = 2
+    without: tuple[str, ...] = ()
 
     @property
     def recurrent(self) -> bool:
@@ -82,25 +86,48 @@ class StageRecipe:
         """Make the stage called ``name`` of a variant whose method is ``whole``.
 
         Raises:
-          ValueError: it is trained at one rate alone, and ``training.rates`` names others.
+          ValueError: it is trained at one rate alone, and ``training.rates`` names others; or ``training.without``
+            names what is no buffer, or one that it cannot do without.
         """
         method = self.method(settings) if self.method else whole
         given = {**vars(settings.stages[name].loss), **self.given(settings)}
         if self.vgg and settings.training.vgg:
             given["vgg_features"] = self.vgg(settings.training.vgg)
-        unrolled = self.unrolls(settings) if self.unrolls else method
+        objective = functools.partial(self.objective, self.unrolls(settings) if self.unrolls else method, **given)
+        rates = settings.training.rates
         if "period" in inspect.signature(self.objective).parameters:
-            periods = {f"1:{period}": period for period in settings.training.rates}
-            tasks = {rate: Task(self.objective(unrolled, **given, period=n), n) for rate, n in periods.items()}
-        elif settings.training.rates != (2,):
-            raise ValueError(
-                f"--set training.rates: {name} is not trained at several rates; expected [2], got "
-                f"{list(settings.training.rates)}. Leave it out, or say VARIANT:training.rates=... for the others."
-            )
+            tasks = {f"1:{period}": Task(objective(period=period), period) for period in rates}
+        elif rates == (2,):
+            tasks = {"1:2": Task(objective())}
         else:
-            tasks = {"": Task(self.objective(unrolled, **given), 2)}
+            raise ValueError(
+                f"--set training.rates: {name} is not trained at several rates; expected [2], got {list(rates)}. Leave "
+                "it out, or say VARIANT:training.rates=... for the others."
+            )
+        tasks = {
+            f"{rate} without {missing}" if missing else rate: task._replace(without=split_names(missing, method))
+            for rate, task in tasks.items()
+            for missing in settings.training.without
+        }
         decay = self.decay if settings.training.anneal else constant
         return Stage(name, method, tasks, settings.stages[name], decay, self.ranges, self.vgg is not None)
+
+
+def split_names(missing: str, method: Method) -> tuple[str, ...]:
+    """Read an entry of ``training.without``: names with "+" between.
+
+    Raises:
+      ValueError: no optional buffer has that name, or ``method`` needs it.
+    """
+    names = tuple(name for name in missing.split("+") if name)
+    wrong = [name for name in names if name not in OPTIONAL_GBUFFERS or name in method.info.requires]
+    if wrong:
+        possible = [name for name in OPTIONAL_GBUFFERS if name not in method.info.requires]
+        raise ValueError(
+            f'--set training.without: expected entries like "base_color+normal", of '
+            f"{', '.join(possible) or 'no buffer'} ({method.info.name} needs the others), got {', '.join(wrong)}."
+        )
+    return names
 
 
 class Page(NamedTuple):

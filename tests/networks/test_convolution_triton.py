@@ -8,11 +8,13 @@ import pytest
 from essjax import kernels
 from essjax.deploy import multiply_adds
 from essjax.networks import compute_dtype, extrassnet
+from essjax.networks._extrassnet import CONDITIONS
 from essjax.networks.blocks import conv
 from essjax.networks.precision import LIKED, pad_channels
 from tests.triton_on_cpu import is_called, load
 
 NAME = "essjax.networks.convolution_triton"
+NONE = np.zeros((1, CONDITIONS), np.float32)
 
 
 def inputs(channels, outputs, size=(2, 11, 37), seed=0):
@@ -74,14 +76,14 @@ def test_its_derivative_is_the_ordinary_ones(monkeypatch):
 def test_a_network_is_the_same_by_it(monkeypatch):
     """ExtraSSNet in float16: 31 input channels, odd sizes; in float32 the kernel is not used."""
     network, x = extrassnet(16), np.random.default_rng(1).normal(size=(1, 13, 18, 31)).astype(np.float32)
-    variables = network.init(jax.random.key(0), x, np.zeros((1, 13, 18, 37), np.float32))
+    variables = network.init(jax.random.key(0), x, np.zeros((1, 13, 18, 37), np.float32), NONE)
     noise = np.random.default_rng(2)
     variables = jax.tree.map(lambda v: v + 0.05 * noise.standard_normal(v.shape, np.float32), variables)
 
     def run(dtype):
         def apply(x):
             with compute_dtype(dtype):
-                return network.apply(variables, x, method="render")[0][0]
+                return network.apply(variables, x, NONE, method="render")[0][0]
 
         return np.asarray(apply(x)), is_called(apply, x)
 
@@ -97,11 +99,12 @@ def test_a_network_is_the_same_by_it(monkeypatch):
 def test_its_products_are_counted_as_ever(monkeypatch):
     """On a GPU too: neither hidden in the kernel nor with the channels that are padded."""
     network, x = extrassnet(16), jax.ShapeDtypeStruct((1, 16, 24, 31), jnp.float32)
-    variables = jax.eval_shape(lambda: network.init(jax.random.key(0), jnp.zeros(x.shape), jnp.zeros((1, 16, 24, 37))))
+    shapes = jnp.zeros(x.shape), jnp.zeros((1, 16, 24, 37)), NONE
+    variables = jax.eval_shape(lambda: network.init(jax.random.key(0), *shapes))
 
     def apply(variables, x):
         with compute_dtype("float16"):
-            return network.apply(variables, x, method="render")[0][0]
+            return network.apply(variables, x, NONE, method="render")[0][0]
 
     expected = multiply_adds(apply, variables, x)
     monkeypatch.setattr(kernels, "_installed", lambda: True)

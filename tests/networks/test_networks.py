@@ -11,6 +11,7 @@ import pytest
 from essjax.frames import select_time
 from essjax.methods import extrass
 from essjax.networks import extrassnet, frnet
+from essjax.networks._extrassnet import CONDITIONS
 from essjax.networks._frnet import OFFSETS, _halfway, _read, matched_flow
 from essjax.networks.blocks import crop, pad_to_multiple
 from essjax.warp import backward_warp
@@ -46,7 +47,8 @@ def test_work_for_540p():
     image = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)
 
     def run(method):
-        return lambda variables, inputs: extrassnet().apply(variables, inputs, method=method)[0]
+        apply = extrassnet().apply
+        return lambda variables, inputs: apply(variables, inputs, jnp.zeros((1, CONDITIONS)), method=method)[0]
 
     ss = giga_operations(run("render"), variables["extrassnet"], image(1, 540, 960, channels_ss))
     ess = giga_operations(run("extrapolate"), variables["extrassnet"], image(1, 540, 960, channels_ess))
@@ -135,12 +137,13 @@ def test_matching_of_equal_frames_finds_no_motion():
 def test_extrassnet_on_odd_sizes():
     network = extrassnet(4, 2)
     ss, ess = random_image(0, 2, 9, 13, 5), random_image(1, 2, 9, 13, 7)
-    variables = network.init(jax.random.key(0), ss, ess)
+    conditions = random_image(2, 2, CONDITIONS)
+    variables = network.init(jax.random.key(0), ss, ess, conditions)
 
     @jax.jit
-    def run(variables, ss, ess):
-        outputs = network.apply(variables, ss, method="render"), network.apply(variables, ess, method="extrapolate")
-        return [output for output, _ in outputs]
+    def run(variables, ss, ess, conditions=conditions):
+        inputs = ("render", ss), ("extrapolate", ess)
+        return [network.apply(variables, images, conditions, method=method)[0] for method, images in inputs]
 
     for head, features in run(variables, ss, ess):
         assert head.shape == (2, 9, 13, 20)
@@ -151,11 +154,14 @@ def test_extrassnet_on_odd_sizes():
     for (head, _), (whole, _) in zip(run(variables, ss, ess), padded, strict=True):
         assert float(jnp.abs(head).max()) > 1e-3
         np.testing.assert_allclose(head, crop(whole, 9, 13), rtol=1e-4, atol=1e-5)
+    for (head, _), (other, _) in zip(run(variables, ss, ess), run(variables, ss, ess, 0 * conditions), strict=True):
+        assert float(jnp.abs(head - other).max()) > 1e-3
 
 
 def test_initial_kernels_have_he_variance_and_depend_on_the_key():
     network = extrassnet(24)
-    inputs = (jax.ShapeDtypeStruct((1, 8, 8, 31), jnp.float32), jax.ShapeDtypeStruct((1, 8, 8, 37), jnp.float32))
+    shapes = (1, 8, 8, 31), (1, 8, 8, 37), (1, CONDITIONS)
+    inputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     first, second = (network.init(jax.random.key(seed), *inputs)["params"] for seed in (0, 1))
     for encoder in ("encoder_ss", "encoder_ess"):
         kernel = np.asarray(first[encoder]["ConvBlock_3"]["Conv_1"]["kernel"])

@@ -40,11 +40,12 @@ def decode(features: list, p: Weights):
 def extrassnet(p: Weights, encoder: str) -> Callable:
     """Head of ``ExtraSSNet.render`` or ``extrapolate``."""
 
-    def forward(x):
+    def forward(x, conditions):
         height, width = x.shape[-2:]
         x, features = pad_to(x, 8), []
         for level in range(4):
             x = conv_block(F.avg_pool2d(x, 2) if level else x, p[encoder][f"ConvBlock_{level}"])
+            x = x + (conditions.reshape(1, -1) @ p[encoder][f"conditions_{level}"]["kernel"])[..., None, None]
             features.append(x)
         return decode(features, p["decoder"])[..., :height, :width]
 
@@ -111,7 +112,7 @@ def _shifted(x, right: float, down: float):
 
 
 def _matched_flow(warped, roughness):
-    """``networks._frnet.matched_flow``."""
+    """``networks._frnet.matched_flow`` of frames that are 1 and 3 frames old."""
     price = COST_PER_PIXEL * (1.0 + COST_OF_ROUGHNESS * (roughness - SMOOTH).clamp(min=0.0))
     costs = []
     for x, y in _OFFSETS:
@@ -127,7 +128,7 @@ def _matched_flow(warped, roughness):
 def frnet(p: Weights) -> Callable:
     """``FRNet.__call__``: the flow, then the features."""
 
-    def forward(warped, roughness):
+    def forward(warped, roughness, ages):
         height, width = warped.shape[-2:]
         warped, roughness = pad_to(warped, 4), pad_to(roughness, 4)
         encoded, hints, matched, x = [], [roughness], [_matched_flow(warped, roughness)], warped

@@ -12,6 +12,7 @@ from essjax.deploy import count_parameters
 from essjax.interfaces import Network
 from essjax.networks import compute_dtype
 from essjax.networks._extranet import input_shapes
+from essjax.networks._extrassnet import CONDITIONS
 from essjax.networks._fasset import LOCAL, PAST
 from essjax.networks._nsrr import FEATURES, PREVIOUS
 from experiments.benchmark import inputs, peers
@@ -52,7 +53,8 @@ def forwards(width: int, height: int) -> list[Forward]:
     # ExtraNet is published at 720p: here 4/3 of the size.
     native = {"height": height * 4 // 3, "width": width * 4 // 3}
     names = {"low": f"{width}x{height}", "high": f"{2 * width}x{2 * height}"}
-    extrass = _shape(*low, 31), _shape(*low, 37)
+    conditions = _shape(1, CONDITIONS)
+    extrass = _shape(*low, 31), _shape(*low, 37), conditions
     fasset = (*(_shape(*low, n) for n in (3, 1, 7, PAST, 24)), _shape(*high, LOCAL), _shape(1, 2))
     features = _shape(*low, 4), _shape(*high, FEATURES), _shape(PREVIOUS, *high, FEATURES)
     frnet = _shape(2, *half, 3), _shape(*half, 1), _shape(2, 1)
@@ -66,7 +68,7 @@ def forwards(width: int, height: int) -> list[Forward]:
     sizes = width * height, 4 * width * height
     to_high = f"{names['low']} to {names['high']}"
     return [
-        forward(f"ExtraSSNet SS, {to_high}", extrassnet, extrass, sizes[1], method="render", given=extrass[:1]),
+        forward(f"ExtraSSNet SS, {to_high}", extrassnet, extrass, sizes[1], method="render", given=extrass[::2]),
         forward(f"ExtraSSNet ESS, {to_high}", extrassnet, extrass, sizes[1], method="extrapolate", given=extrass[1:]),
         forward(f"FRNet, {half[2]}x{half[1]}", networks.frnet(), frnet, sizes[0], output="flow"),
         forward(
