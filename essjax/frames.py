@@ -347,20 +347,6 @@ def without_color(frame: Frame) -> Frame:
     return dataclasses.replace(frame, color=None)
 
 
-def without_buffers(frame: Frame, names: Iterable[str]) -> Frame:
-    """Remove optional G-buffers and the reactive mask by name: the frame as an engine without them would give it.
-
-    Raises:
-      ValueError: an unknown name, or one that every frame must have.
-    """
-    names, optional = list(names), (*OPTIONAL_GBUFFERS, "reactive")
-    unknown = [name for name in names if name not in optional]
-    if unknown:
-        raise ValueError(f"without_buffers: expected some of {', '.join(optional)}, got {', '.join(unknown)}.")
-    gbuffers = dataclasses.replace(frame.gbuffers, **{name: None for name in names if name != "reactive"})
-    return dataclasses.replace(frame, gbuffers=gbuffers, **({"reactive": None} if "reactive" in names else {}))
-
-
 def example_frame(width: int, height: int) -> Frame:
     """Make the shapes of one frame ``[1, H, W, C]`` with every buffer (``jax.ShapeDtypeStruct`` leaves)."""
 

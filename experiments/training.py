@@ -15,9 +15,9 @@ import jax
 import numpy as np
 
 from essjax.builtin import RENDERER, live_source
-from essjax.data import CachedSource, Mixed, Rounds, Source, clips, disk_source, successive_clips
+from essjax.data import CachedSource, Mixed, Rounds, Source, clips, disk_source, successive_clips, without_buffers
 from essjax.data.layout import Dataset
-from essjax.frames import Sequence, select_time, without_buffers
+from essjax.frames import Sequence, select_time
 from essjax.train import (
     OPTIMIZERS,
     Checkpoints,

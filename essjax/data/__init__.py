@@ -1,6 +1,6 @@
 """Datasets on disk, import of renders, and the loader. Files: ``layout``; conventions: docs/conventions.md."""
 
-from essjax.data.augment import crop, flip, start_with_cut
+from essjax.data.augment import crop, flip, start_with_cut, without_buffers
 from essjax.data.importing import PRESETS, ImportReport, import_dataset
 from essjax.data.layout import Dataset, Segment, SequenceInfo, read_dataset, write_dataset
 from essjax.data.loader import CachedSource, Source, clips, disk_source
@@ -13,5 +13,6 @@ from essjax.data.successive import successive_clips
 __all__ = [
     "PRESETS", "CachedSource", "Dataset", "ImportReport", "Mixed", "Rounds", "Segment", "SequenceInfo",
     "SequenceWriter", "Source", "clips", "crop", "disk_source", "flip", "import_dataset", "read_dataset",
-    "read_segment", "read_sequence", "start_with_cut", "successive_clips", "write_dataset", "write_sequence",
+    "read_segment", "read_sequence", "start_with_cut", "successive_clips", "without_buffers",
+    "write_dataset", "write_sequence",
 ]  # fmt: skip

@@ -1,13 +1,13 @@
 """Crops and flips of NumPy sequences that keep every convention: images, motion, jitter, normals, cameras, masks."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import numpy as np
 
-from essjax.buffers import BUFFERS, RANGES
+from essjax.buffers import BUFFERS, OPTIONAL_GBUFFERS, RANGES
 from essjax.cameras import Camera
 from essjax.frames import Frame, SampleRanges, Sequence, frame_images, gbuffers_of
 
@@ -183,3 +183,17 @@ def flip(sequence: Sequence, direction: str) -> Sequence:
         ranges=None if sequence.ranges is None else _flip_ranges(sequence.ranges, component),
         **{name: None if mask is None else np.flip(mask, axis) for name, mask in masks.items()},
     )
+
+
+def without_buffers(frame: Frame, names: Iterable[str]) -> Frame:
+    """Remove optional G-buffers and the reactive mask by name: the frame as an engine without them would give it.
+
+    Raises:
+      ValueError: an unknown name, or one that every frame must have.
+    """
+    names, optional = list(names), (*OPTIONAL_GBUFFERS, "reactive")
+    unknown = [name for name in names if name not in optional]
+    if unknown:
+        raise ValueError(f"without_buffers: expected some of {', '.join(optional)}, got {', '.join(unknown)}.")
+    gbuffers = dataclasses.replace(frame.gbuffers, **{name: None for name in names if name != "reactive"})
+    return dataclasses.replace(frame, gbuffers=gbuffers, **({"reactive": None} if "reactive" in names else {}))

@@ -44,7 +44,7 @@ def test_a_stage_may_be_named_alone_or_left_out():
         ("width", "--set width: expected path=value."),
         ("method.width=wide", "--set method.width: expected int, got 'wide'"),
         ("data.size=[96]", r"--set data.size: expected \[width,height\], got \(96,\)"),
-        ("data.jitter=sobol", r"--set data.jitter: expected Literal\['halton', 'dlctus'\], got 'sobol'"),
+        ("data.jitter=sobol", r"--set data.jitter: expected Literal\['kronecker', 'dlctus'\], got 'sobol'"),
         ("frnet.seconds=null", "stages.frnet.steps and seconds are both null; give one of them"),
         ("data.test_frames=1", "--set data.test_frames: expected at least 2, got 1"),
         ("method.width=0", "--set method.width: expected at least 1, got 0"),

@@ -60,7 +60,7 @@ def test_every_phase_gives_each_frame_once_per_distance_in_order(length, period)
 
     @jax.jit
     def run(clip):
-        phases.extend(every_phase(fake(said), {}, clip, lambda aux: aux, period)[0])
+        phases.extend(every_phase(fake(said), {}, clip, lambda aux: aux, period=period)[0])
         return [phase.kept for phase in phases]
 
     found = run(numbered(length))
@@ -82,12 +82,12 @@ def test_every_phase_gives_each_frame_once_per_distance_in_order(length, period)
 def test_clips_that_do_not_fit_are_cut_or_refused(length, period, fitting):
     message = f"clip: expected {period - 1} frames and a multiple of {period} .*, got {length}"
     with pytest.raises(ValueError, match=message):
-        every_phase(fake(lambda *_: {}), {}, numbered(length), lambda aux: aux, period)
+        every_phase(fake(lambda *_: {}), {}, numbered(length), lambda aux: aux, period=period)
     if fitting:
-        assert whole_periods(numbered(length), period).reference.shape[0] == fitting
+        assert whole_periods(numbered(length), period=period).reference.shape[0] == fitting
     else:
         with pytest.raises(ValueError, match=f"clip: expected at least {2 * period - 1} frames .*, got {length}"):
-            whole_periods(numbered(length), period)
+            whole_periods(numbered(length), period=period)
 
 
 def follow(objective, windows, step):
@@ -110,10 +110,10 @@ def test_all_runs_go_on_where_the_clip_before_ended(period):
     method = fake(said)
 
     def follow_it(variables, clip, history):
-        phases, state, history = follow_every_phase(method, variables, clip, lambda aux: aux, history, period)
+        phases, state, history = follow_every_phase(method, variables, clip, lambda aux: aux, history, period=period)
         return [phase.kept for phase in phases], state, history
 
-    recurrent = Recurrent(lambda clip: start_every_phase(method, clip, period), follow_it, period)
+    recurrent = Recurrent(lambda clip: start_every_phase(method, clip, period=period), follow_it, period)
     (whole,) = follow(recurrent, 1, 12)
     for number, part in enumerate(follow(recurrent, 2, 6)):
         expected = jax.tree.map(lambda leaf, first=6 * number: leaf[first : first + 6], whole)

@@ -77,7 +77,7 @@ class Recurrent:
 
     def __call__(self, variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
         """Return the terms of a clip that nothing precedes, and the new statistics."""
-        clip = _begun(whole_periods(clip, self.period))
+        clip = _begun(whole_periods(clip, period=self.period))
         return self.follow(variables, clip, self.start(clip))[:2]
 
 
@@ -123,7 +123,7 @@ def fitting_length(length: int, period: int) -> int:
     return taken + period - 1 if taken > 0 else 0
 
 
-def whole_periods(clip: Sequence, period: int = 2) -> Sequence:
+def whole_periods(clip: Sequence, *, period: int = 2) -> Sequence:
     """``clip`` without the last frames that ``every_phase`` has no use for.
 
     Raises:
@@ -155,13 +155,19 @@ def _runs(frames: Frame, period: int) -> Frame:
     return dataclasses.replace(runs, cut=cut)
 
 
-def start_every_phase(method: Method, clip: Sequence, period: int = 2) -> PyTree:
+def start_every_phase(method: Method, clip: Sequence, *, period: int = 2) -> PyTree:
     """Make the history that ``follow_every_phase`` needs for a clip whose frame 0 is a cut."""
     return method.start(select_time(_runs(clip.frames, period), 0))
 
 
 def follow_every_phase(
-    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree], history: PyTree, period: int = 2
+    method: Method,
+    variables: PyTree,
+    clip: Sequence,
+    keep: Callable[[dict], PyTree],
+    history: PyTree,
+    *,
+    period: int = 2,
 ) -> Phases:
     """``every_phase`` of a clip that begins ``period - 1`` frames before the end of the clip that left ``history``.
 
@@ -185,7 +191,7 @@ def follow_every_phase(
 
 
 def every_phase(
-    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree], period: int = 2
+    method: Method, variables: PyTree, clip: Sequence, keep: Callable[[dict], PyTree], *, period: int = 2
 ) -> tuple[list[Phase], PyTree]:
     """Unroll ``clip`` in ``period`` runs side by side in one scan, each from a frame later; each begins with SS.
 
@@ -200,8 +206,8 @@ def every_phase(
       ValueError: the number of frames does not fit the period, see ``whole_periods``.
     """
     clip = _begun(clip)
-    history = start_every_phase(method, clip, period)
-    return follow_every_phase(method, variables, clip, keep, history, period)[:2]
+    history = start_every_phase(method, clip, period=period)
+    return follow_every_phase(method, variables, clip, keep, history, period=period)[:2]
 
 
 def predict_last(method: Method, variables: PyTree, frames: Frame, schedule: Schedule | None = None) -> Prediction:

@@ -54,9 +54,9 @@ def frnet_objective(method: Method, *, feature_weight: float = 0.001, period: in
     network = method.network("frnet")
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
-        clip = whole_periods(clip, period)
+        clip = whole_periods(clip, period=period)
         keep = lambda aux: {name: aux[name] for name in ("extrapolated", "exposure") if name in aux}  # noqa: E731
-        phases, state = every_phase(method, variables, clip, keep, period)
+        phases, state = every_phase(method, variables, clip, keep, period=period)
         terms = [_frnet_terms(network, variables, clip, phase, period, feature_weight) for phase in phases[1:]]
         return {name: mean_of(each[name] for each in terms) for name in terms[0]}, state
 
@@ -115,7 +115,7 @@ def extrass_objective(
         return {name: aux[name] for name in ("log_image", "warped", "features", "exposure")}
 
     def start(clip: Sequence) -> PyTree:
-        return start_every_phase(method, clip, period)
+        return start_every_phase(method, clip, period=period)
 
     def phase_terms(clip: Sequence, phase: Phase) -> dict[str, Array]:
         part, predicted = select_time(clip, phase.frames), phase.kept
@@ -140,7 +140,7 @@ def extrass_objective(
         return terms
 
     def follow(variables: PyTree, clip: Sequence, history: PyTree) -> tuple[dict[str, Array], PyTree, PyTree]:
-        phases, state, history = follow_every_phase(method, variables, clip, keep, history, period)
+        phases, state, history = follow_every_phase(method, variables, clip, keep, history, period=period)
         found = [phase_terms(clip, phase) for phase in phases]
         features = temporal_weight * _features_term(clip, phases, period)
         return {**by_kind(found), "features": features}, state, history

@@ -51,9 +51,9 @@ def fasset_objective(
         }
 
     def objective(variables: PyTree, clip: Sequence) -> tuple[dict[str, Array], PyTree]:
-        clip = whole_periods(clip, period)
+        clip = whole_periods(clip, period=period)
         keep = lambda aux: {name: aux[name] for name in ("log_image", "valid", "exposure")}  # noqa: E731
-        phases, state = every_phase(method, variables, clip, keep, period)
+        phases, state = every_phase(method, variables, clip, keep, period=period)
         found = [phase_terms(clip, phase) for phase in phases]
         return by_kind(found), state
 
