@@ -30,7 +30,7 @@ class Rendering(NamedTuple):
         upscalers ask engines for (textures as sharp as the output's), ``log2(scale)`` what LR alone would need.
         Eq 47 of thesis 002, -log2(f) - log2(spp) / 2 over an *input* pixel, is ``-log2(spp) / 2`` here: 0 for its
         dataset 1 (1 sample per pixel), -1 for its dataset 2 (4 samples per pixel).
-      jitter: pattern of the LR frames, see ``jitter_sequence``; native frames always have Halton's.
+      jitter: pattern of the LR frames, see ``jitter_sequence``; native frames always have the default.
     """
 
     scale: int = 2

@@ -6,27 +6,16 @@ import os
 from pathlib import Path
 
 JITTER_UNIT = "LR pixels, sample at pixel centre + (x, y), y down"
-PERIOD = 16
-"""Elements of the jitter sequence before it repeats."""
-
-
-def halton(index: int, base: int) -> float:
-    """Compute the radical inverse of ``index`` (>= 1) in ``base``."""
-    result, fraction = 0.0, 1.0
-    while index > 0:
-        fraction /= base
-        result += fraction * (index % base)
-        index //= base
-    return result
+STEP = (0.829019, 0.600993)
+"""From each frame's jitter to the next one's, modulo a pixel: that of essjax.scenes."""
 
 
 def jitter(frame: int) -> tuple[float, float]:
-    """(x right, y down) in LR pixels, in [-0.5, 0.5): Halton (2, 3) by ``frame // 2``, odd frames half a pixel further.
+    """(x right, y down) in LR pixels, in [-0.5, 0.5): ``frame`` steps, modulo a pixel.
 
-    So even frames alone, odd frames alone and all together cover the pixel.
+    Every frame, every second, third and fourth of them cover the pixel evenly.
     """
-    index, shift = 1 + (frame // 2) % PERIOD, frame % 2 / 2
-    return (halton(index, 2) + shift) % 1 - 0.5, (halton(index, 3) + shift) % 1 - 0.5
+    return frame * STEP[0] % 1 - 0.5, frame * STEP[1] % 1 - 0.5
 
 
 def camera_shift(jitter: tuple[float, float], width: int, height: int, sensor_fit: str) -> tuple[float, float]:
