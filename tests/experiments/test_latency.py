@@ -56,21 +56,27 @@ def _shown(color):
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-@pytest.mark.parametrize(("kind", "now", "before"), [("ss", 4, 2), ("ess", 3, 1)])
-def test_the_input_shows_what_was_rendered_last(clip, kind, now, before):
-    """Every other frame is rendered; the previous picture is that of the same phase, two frames back."""
-    color, picture = np.asarray(clip.sequence.frames.color), _new_picture(clip, 4, kind, low=True)
+@pytest.mark.parametrize(
+    ("rate", "kind", "now", "before"), [(2, "ss", 4, 2), (2, "ess", 3, 1), (3, "ss", 4, 1), (3, "ess", 2, None)]
+)
+def test_the_input_shows_what_was_rendered_last(clip, rate, kind, now, before):
+    """The previous picture is that of the same phase, ``rate`` frames back; as ESS, as far away as it gets."""
+    color, picture = np.asarray(clip.sequence.frames.color), _new_picture(clip, 4, kind, True, rate)
+    if before is None:  # it would be before the clip
+        np.testing.assert_array_equal(picture["images"]["input"], color[now])
+        assert picture["previous"] == {}
+        return
     np.testing.assert_array_equal(picture["images"]["input"], color[now])
     np.testing.assert_array_equal(picture["previous"]["input"], color[before])
     np.testing.assert_array_equal(picture["images"]["reference"], color[4])
-    np.testing.assert_array_equal(picture["previous"]["reference"], color[2])
+    np.testing.assert_array_equal(picture["previous"]["reference"], color[4 - rate])
 
 
 @pytest.mark.parametrize(("n", "kind"), [(7, "ss"), (7, "ess"), (8, "ess"), (2, "ess")])
 def test_what_precedes_the_shot_is_no_previous_picture(clip, n, kind):
     """Frame 6 is a cut: as ESS, frame 8 would be compared with a picture made of nothing."""
-    assert _new_picture(clip, n, kind, low=True)["previous"] == {}
-    assert _new_picture(clip, 8, "ss", low=True)["previous"] and _new_picture(clip, 3, "ess", low=True)["previous"]
+    assert _new_picture(clip, n, kind, True, 2)["previous"] == {}
+    assert _new_picture(clip, 8, "ss", True, 2)["previous"] and _new_picture(clip, 3, "ess", True, 2)["previous"]
 
 
 def test_pictures_show_no_repeated_frame(clip):

@@ -38,7 +38,7 @@ OFFSETS = sorted(
     key=lambda offset: np.hypot(*offset),
 )  # fmt: skip
 """Pixels off the stated place at which an object is looked for; the first is that place."""
-ELSEWHERE = ((0.79, 0.015, 0.0, 0.0), (0.65, 0.015, 0.4, 1.5))
+ELSEWHERE = ((0.75, 0.015, 0.0, 0.0), (0.65, 0.015, 0.4, 1.5))
 """An object is elsewhere if the mismatch of its interior, or of all of it, is there less than this share of the stated
 one, and less by this much, and its blocks agree on so many pixels, and there are more than so many blocks per frame:
 outlines fit here and there by chance."""
