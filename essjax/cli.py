@@ -21,8 +21,9 @@ from essjax.data.importing.draft import CERTAIN, LIKELY, UNKNOWN
 from essjax.data.json_files import write_json
 from essjax.data.layout import read_dataset
 from essjax.files import atomic
+from essjax.kernels import check_platform
 from essjax.scenes import Rendering
-from essjax.stopping import Interrupted, stoppable
+from essjax.stopping import stoppable
 
 _console = Console()
 
@@ -311,13 +312,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; bad input and a failing disk print one line and return 2, Ctrl-C returns 130, SIGTERM 143."""
 
     def command() -> int:
+        check_platform()
         return tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="essjax", description=__doc__, args=argv) or 0
 
     try:
         return stoppable(command, _say_waiting, _say_stopped)
-    except Interrupted as stop:
-        _console.print(f"interrupted: {stop}", markup=False, highlight=False, soft_wrap=True)
-        return stop.code
     except ValueError as error:
         _console.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         return 2
@@ -335,9 +334,9 @@ def _say_waiting() -> None:
     _console.print("stopping after the frames in hand; once more to stop at once", soft_wrap=True)
 
 
-def _say_stopped() -> None:
+def _say_stopped(text: str = "") -> None:
     _console.show_cursor()  # progress bars hide it
-    _console.print("interrupted; run the same command again to resume.", soft_wrap=True)
+    _console.print(f"interrupted; {text or 'run the same command again to resume.'}", markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,21 @@ def backend() -> str:
     return "gpu" if platform in ("cuda", "rocm") else platform
 
 
+def check_platform() -> None:
+    """Raise a ValueError where ``JAX_PLATFORMS`` names a platform that is not here."""
+    wanted = os.environ.get("JAX_PLATFORMS")
+    if not wanted:
+        return
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # the latter where there is no plugin at all
+        reason = (str(error).splitlines() or ["there is no plugin for it"])[0]
+        raise ValueError(
+            f"JAX_PLATFORMS={wanted}: JAX cannot run there ({reason}). Install its plugin (for NVIDIA: pip install "
+            "'essjax[gpu]'), or leave JAX_PLATFORMS away."
+        ) from error
+
+
 def on_gpu() -> bool:
     """Whether programs for a GPU are to be made."""
     return backend() == "gpu" and not _plain.get()

@@ -12,12 +12,15 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _POLL = 0.1
 """Seconds after which the main thread looks at what it heard."""
+_UNWIND = 1.0
+"""Seconds that a command has from the end of its section to its own end."""
 _STACK = 64 << 20
 """Bytes of the command's stack, where some systems give 512 kB to a thread: tracing nests deeply."""
 
@@ -42,6 +45,7 @@ class _Ears:
         self.heard: list[int] = []  # numbers of the signals
         self.sections = 0
         self.command = False  # ``stoppable`` listens
+        self.ended = 0.0  # when a section raised ``Interrupted``
 
 
 _ears = _Ears()
@@ -90,7 +94,7 @@ class finishing:  # noqa: N801  a context manager, as contextlib names them
             _ears.sections -= 1
 
     def _raise(self) -> None:
-        number = _ears.heard[0]
+        number, _ears.ended = _ears.heard[0], time.monotonic()
         if not _ears.command and not _ears.sections:
             _ears.heard.clear()
         raise Interrupted(self._saved(), 128 + number)
@@ -119,15 +123,18 @@ def _remember(number: int, stack: Any) -> None:
         os.kill(os.getpid(), number)
 
 
-def stoppable(command: Callable[[], int], waiting: Callable[[], Any], stopped: Callable[[], Any]) -> int:
+def stoppable(command: Callable[[], int], waiting: Callable[[], Any], stopped: Callable[[str], Any]) -> int:
     """Run ``command`` in a thread, while this one listens; returns its exit code, raises what it raises.
+
+    After a signal the process ends here: Python would wait for threads that compile.
 
     Where it is not called in the main thread, or in another command, it just runs it.
 
     Args:
       command: may raise ``Interrupted`` from its sections.
       waiting: called when a signal came and something is in hand.
-      stopped: called when the process ends at once, with 128 and the signal's number: says how to go on.
+      stopped: called when the process ends because of a signal, with 128 and its number: says how to go on; it is
+        given what the section says that was in hand, or "".
     """
     if threading.current_thread() is not threading.main_thread() or _ears.command:
         return command()
@@ -139,9 +146,9 @@ def stoppable(command: Callable[[], int], waiting: Callable[[], Any], stopped: C
         except BaseException as error:  # noqa: BLE001  raised again below
             outcome["error"] = error
 
-    def leave() -> None:
+    def leave(text: str = "") -> None:
         if len(_ears.heard) < 3:  # the third one does not wait for a terminal either
-            for each in (stopped, sys.stdout.flush, sys.stderr.flush):
+            for each in (lambda: stopped(text), sys.stdout.flush, sys.stderr.flush):
                 with contextlib.suppress(Exception):
                     each()
         os._exit(128 + _ears.heard[0])
@@ -161,11 +168,13 @@ def stoppable(command: Callable[[], int], waiting: Callable[[], Any], stopped: C
             thread.join(_POLL)
             if _ears.heard:
                 with _ears.lock:  # nothing begins meanwhile
-                    if thread.is_alive() and not _ears.sections:
+                    if thread.is_alive() and not _ears.sections and time.monotonic() - _ears.ended > _UNWIND:
                         leave()
-                if not told:
+                if not told and _ears.sections:
                     told = True
                     waiting()
+        if isinstance(outcome.get("error"), Interrupted) and _ears.heard:
+            leave(str(outcome["error"]))
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -88,22 +89,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def guarded(command: Callable[[Console], int], again: str = "Run the same command with --resume to continue.") -> int:
     """Run ``command``; returns 2 after a line about bad input, 130 (Ctrl-C) or 143 (SIGTERM) and ``again``."""
-    from essjax.stopping import Interrupted, stoppable
+    from essjax.stopping import stoppable
 
     console = Console()
 
     def waiting() -> None:
         console.print("Stopping after this step; once more to stop at once.", soft_wrap=True)
 
-    def stopped() -> None:
+    def stopped(text: str = "") -> None:
         console.show_cursor()  # progress bars hide it
-        console.print(Text.assemble(("Stopped.", "red"), f" {again}"), soft_wrap=True)
+        console.print(Text.assemble(("Stopped:" if text else "Stopped.", "red"), f" {text or again}"), soft_wrap=True)
+
+    def checked() -> int:
+        if os.environ.get("JAX_PLATFORMS"):
+            from essjax.kernels import check_platform
+
+            check_platform()
+        return command(console)
 
     try:
-        return stoppable(lambda: command(console), waiting, stopped)
-    except Interrupted as stop:
-        print_error(stop, console, "Stopped")
-        return stop.code
+        return stoppable(checked, waiting, stopped)
     except (ValueError, RuntimeError, OSError) as error:
         print_error(error, console)
         return 2
@@ -112,9 +117,11 @@ def guarded(command: Callable[[Console], int], again: str = "Run the same comman
         return 130
 
 
-def print_error(error: Exception, console: Console, label: str = "Error") -> None:
+def print_error(error: Exception, console: Console) -> None:
     """One line; brackets in the message are no markup."""
-    console.print(Text.assemble((f"{label}:", "red"), f" {error}"), soft_wrap=True)
+    hint = " Is it the right path, may it be used, is the disk full?" if isinstance(error, OSError) else ""
+    text = " ".join(str(error).splitlines())
+    console.print(Text.assemble(("Error:", "red"), f" {text}{hint}"), soft_wrap=True)
 
 
 def exit_code(metrics: Mapping[str, Any], console: Console) -> int:

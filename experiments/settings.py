@@ -335,7 +335,7 @@ def _check_number(path: str, number: float, *, is_int: bool) -> None:
 
 
 _BOUNDS = {
-    "seed": (0, math.inf), "train_frames": (2, math.inf), "test_frames": (2, math.inf), "clip": (2, math.inf),
+    "seed": (0, 2**31), "train_frames": (2, math.inf), "test_frames": (2, math.inf), "clip": (2, math.inf),
     "rates": (2, 9), "mip_bias": (-math.inf, math.inf), "average": (0, 1), "warmup": (0, math.inf),
     "pictures": (0, math.inf),
 }  # fmt: skip

@@ -132,7 +132,7 @@ def read_json(path: Path) -> dict:
     except FileNotFoundError as error:
         raise ValueError(f"{path}: not found. Is this the right folder, and is the data complete?") from error
     except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected JSON, cannot read it ({error}).") from error
+        raise ValueError(f"{path}: expected JSON, cannot read it ({error!s:.200}).") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
     return content

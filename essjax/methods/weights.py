@@ -37,14 +37,17 @@ def save(path: str | Path, method: Method, variables: PyTree) -> None:
       variables: dictionaries of arrays, as ``method.init`` makes them.
 
     Raises:
-      ValueError: the method is not one that ``make`` makes.
+      ValueError: the method is not one that ``make`` makes, or the file cannot be written.
     """
     path, tensors = Path(path), _flat(variables)
     header = {"format": FORMAT, "version": essjax.__version__, **_described(method), **_facts(method)}
     header["checksum"] = _checksum(header, tensors)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic(path) as temporary:
-        save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
+        try:
+            save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
+        except SafetensorError as error:  # of the disk
+            raise ValueError(f"{path}: cannot write the weights ({error}). Is the disk full?") from error
 
 
 def load(path: str | Path) -> tuple[Method, PyTree]:

@@ -1,9 +1,8 @@
-"""Checkpoints of a stage: orbax, atomic, checked, with the data iterator's position and the run's clock.
+"""Checkpoints of a stage: atomic, checked, with the data iterator's position and the run's clock.
 
-    12/state/           arrays, as orbax writes them
-    12/arrays.json      their names, types and shapes
-    12/progress.json    the data iterator's position and the run's clock
-    12/SHA256SUMS       of every file above; ``sha256sum -c SHA256SUMS`` checks them, too
+    12/state.safetensors    the arrays, by their names in the tree
+    12/progress.json        the data iterator's position and the run's clock
+    12/SHA256SUMS           of both files; ``sha256sum -c SHA256SUMS`` checks them, too
 
 A checkpoint has another name until all of it is there. One that does not fit its checksums is damaged: it is named,
 and the newest whole one takes its place.
@@ -21,14 +20,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 
 from essjax.files import only_writer
 from essjax.typing import PyTree
 
 KEPT = 2
 """How many checkpoints stay."""
-SUMS = "SHA256SUMS"
+STATE, PROGRESS, SUMS = "state.safetensors", "progress.json", "SHA256SUMS"
 _TEMPORARY = ".unfinished"
 
 
@@ -44,7 +44,6 @@ class Checkpoints:
 
     def __init__(self, path: Path):
         self.path = Path(path).absolute()
-        self._orbax = ocp.Checkpointer(ocp.StandardCheckpointHandler())
         self._damaged: set[int] = set()
         self._holds, self._held = False, contextlib.ExitStack()
 
@@ -75,19 +74,19 @@ class Checkpoints:
         try:
             for leftover in self.path.glob(f"*{_TEMPORARY}"):
                 shutil.rmtree(leftover)
-            self._orbax.save(temporary / "state", args=ocp.args.StandardSave(state))
-            for name, content in (("arrays", _described(state)), ("progress", progress)):
-                (temporary / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+            temporary.mkdir(parents=True)
+            save_file(_named(state), temporary / STATE)
+            (temporary / PROGRESS).write_text(json.dumps(progress), encoding="utf-8")
             sums = "".join(f"{digest}  {name}\n" for name, digest in _checksums(temporary).items())
             (temporary / SUMS).write_text(sums, encoding="utf-8")
             temporary.rename(self.path / str(step))
-        except Exception as error:  # orbax's own errors are of many kinds and have many lines
+        except (OSError, SafetensorError) as error:
             shutil.rmtree(temporary, ignore_errors=True)
             before = self.latest()
             rest = f"checkpoint {before} is as it was" if before is not None else "there is none before it"
             raise ValueError(
-                f"{self.path / str(step)}: cannot write the checkpoint ({_reason(error)}); {rest}. Is the disk full? "
-                "Make room and run the same command with --resume."
+                f"{self.path / str(step)}: cannot write the checkpoint ({error}); {rest}. Is the disk full? Make room "
+                "and run the same command with --resume."
             ) from error
         for old in self._steps()[KEPT:]:
             shutil.rmtree(self.path / str(old), ignore_errors=True)
@@ -119,31 +118,22 @@ class Checkpoints:
 
     def _restore(self, step: int, like: PyTree) -> tuple[PyTree, dict[str, Any]]:
         folder = self.path / str(step)
-        arrays, progress = (json.loads((folder / f"{name}.json").read_bytes()) for name in ("arrays", "progress"))
-        wanted = _described(like)
-        different = [name for name in {**wanted, **arrays} if wanted.get(name) != arrays.get(name)]
-        if different:  # asked first: orbax answers with pages
+        arrays, progress = load_file(folder / STATE), json.loads((folder / PROGRESS).read_bytes())
+        wanted = _named(like)
+        different = [name for name in {**wanted, **arrays} if _kind(wanted.get(name)) != _kind(arrays.get(name))]
+        if different:
             name = next((name for name in different if ".variables" in name), different[0])  # users know those
-            found, asked = (tree.get(name, "absent") for tree in (arrays, wanted))
+            found, asked = (_kind(tree.get(name)) for tree in (arrays, wanted))
             more = f", and {len(different) - 1} more" if different[1:] else ""
             raise ValueError(
                 f"{self.path}: checkpoint {step} does not fit this configuration ({name} is {found} there, {asked} "
                 f"here{more}). Use the settings that it was trained with, or another --out."
             )
-        target = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
-        try:
-            restored = self._orbax.restore(folder / "state", args=ocp.args.StandardRestore(target))
-        except Exception as error:
-            raise ValueError(
-                f"{folder}: cannot read the checkpoint ({_reason(error)}), though its checksums fit. Another version "
-                "of orbax-checkpoint may have written it."
-            ) from error
-        # Copied from the host: orbax ties arrays to their device, which is another program to JAX, compiled once more.
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), restored), progress
+        leaves = [jnp.asarray(arrays[name]) for name in wanted]
+        return jax.tree.unflatten(jax.tree.structure(like), leaves), progress
 
     def close(self) -> None:
-        """Release orbax's threads and the folder."""
-        self._orbax.close()
+        """Let others save in the folder."""
         self._held.close()
         self._holds = False
 
@@ -151,16 +141,15 @@ class Checkpoints:
 _log = logging.getLogger(__name__)
 
 
-def _reason(error: Exception) -> str:
-    """First line of what orbax says, or where it says nothing the kind of its error."""
-    text = str(error).strip()
-    return text.splitlines()[0][:200] if text else type(error).__name__
-
-
-def _described(tree: PyTree) -> dict[str, str]:
-    """Name -> type and shape of every array, ``"float32[2, 3]"``."""
+def _named(tree: PyTree) -> dict[str, np.ndarray]:
+    """Arrays by their names in the tree, in its order."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in leaves}
+    return {jax.tree_util.keystr(path): np.asarray(leaf, order="C") for path, leaf in leaves}
+
+
+def _kind(array: np.ndarray | None) -> str:
+    """Type and shape, ``"float32[2, 3]"``."""
+    return "absent" if array is None else f"{array.dtype}{list(array.shape)}"
 
 
 def _checksums(folder: Path) -> dict[str, str]:

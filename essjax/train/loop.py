@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from essjax.files import atomic
+from essjax.files import atomic, naming
 from essjax.stopping import finishing
 from essjax.train.checkpoint import Checkpoints
 from essjax.train.state import TrainState, averaged
@@ -109,7 +109,7 @@ def train(
     _truncate(log_path, step)
     last_save = time.monotonic()
     saved = lambda: f"stopped at step {step}; the state is saved. Run the same command with --resume."
-    with finishing(saved) as section, log_path.open("a") as log:
+    with finishing(saved) as section, naming(log_path), log_path.open("a") as log:
 
         def save():
             log.flush()

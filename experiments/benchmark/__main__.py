@@ -81,10 +81,12 @@ def _benchmark(options: Command, console: Console) -> int:
     import jax
 
     from essjax.data.json_files import write_json
+    from essjax.kernels import check_platform
     from experiments.benchmark import machine, schema, suites
     from experiments.benchmarks_page import RESULTS
     from experiments.environment import environment
 
+    check_platform()
     settings = suites.Options(
         width, height, options.repetitions, options.frames, options.peers, options.dtypes, options.only,
     )  # fmt: skip

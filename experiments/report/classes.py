@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from essjax.files import atomic
 from experiments.report.images import shown, to_bytes
 from experiments.report.sheets import GAP, INK, LABEL, MUTED, PAPER, TITLE
 
@@ -74,5 +75,6 @@ def write_class_sheet(
         draw.text((left + 28, top + 28 * row + 1), name, fill=MUTED, font=ImageFont.load_default(15))
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"labels-{re.sub(r'[^A-Za-z0-9_-]+', '-', title)}.png"
-    sheet.save(path, compress_level=4)
+    with atomic(path) as temporary:
+        sheet.save(temporary, "PNG", compress_level=4)
     return path

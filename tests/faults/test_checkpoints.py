@@ -48,12 +48,10 @@ DAMAGES = {
 def test_a_damaged_checkpoint_is_named_and_the_one_before_restored(tmp_path, saved, caplog, damage):
     """Every file in turn. On the old code flips in the data came back as other numbers."""
     files = sorted(path.relative_to(saved) for path in (saved / "2").rglob("*") if path.is_file())
-    assert len(files) > 8
+    assert len(files) == 3
     for number, name in enumerate(files):
         folder = tmp_path / str(number)
         shutil.copytree(saved, folder)
-        if not (folder / name).stat().st_size and damage != "delete":
-            continue
         DAMAGES[damage](folder / name)
         caplog.clear()
         checkpoints = Checkpoints(folder)
@@ -102,7 +100,7 @@ def test_training_goes_on_from_the_whole_one_as_if_nothing_had_happened(tmp_path
     with pytest.raises(Killed):
         tiny_run.run(run, on_step=on_step, save_every=0.0)
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["4", "5"]
-    flip(next(path for path in (run / "checkpoints" / "5").rglob("*") if path.parent.name == "d"))
+    flip(run / "checkpoints" / "5" / "state.safetensors")
     steps = []
     found, _ = tiny_run.run(run, on_step=lambda step, progress, terms: steps.append(step), save_every=0.0)
     assert steps[0] == 5 and "checkpoint 5 is damaged" in caplog.text

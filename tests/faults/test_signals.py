@@ -23,17 +23,12 @@ def start(body, before=""):
     """A Python process that runs ``body`` as a command, in an own session like a terminal's foreground job."""
     script = textwrap.dedent("""
         import sys, time
-        from essjax.stopping import Interrupted, finishing, stoppable
+        from essjax.stopping import finishing, stoppable
         def say(text):
             print(text, flush=True)
         def command():
         BODY
-        try:
-            code = stoppable(command, lambda: say("waiting"), lambda: say("stopped"))
-        except Interrupted as stop:
-            say(stop)
-            code = stop.code
-        sys.exit(code)
+        sys.exit(stoppable(command, lambda: say("waiting"), lambda text: say(text or "stopped")))
     """).replace("BODY", textwrap.indent(textwrap.dedent(body), "    "))
     command = ["sh", "-c", f'{before} exec "$@"', "sh", sys.executable, "-c", script]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

@@ -74,7 +74,7 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
     try:
         index = _ratio_index(path, content, width)
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected TargetResolution and UpscalingRatiosIndices ({error!r}).") from error
+        raise ValueError(f"{path}: expected TargetResolution and UpscalingRatiosIndices ({error!r:.200}).") from error
 
     def facts(number: int, header: Mapping[str, Any]) -> FrameFacts:
         record = lookup(path, frames, number)
@@ -91,7 +91,7 @@ def arm_facts(path: Path, width: int, height: int) -> Facts:
             )
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise ValueError(
-                f"{path}, frame {number}: a field is missing or has the wrong form ({error!r})."
+                f"{path}, frame {number}: a field is missing or has the wrong form ({error!r:.200})."
             ) from error
 
     return facts
@@ -109,7 +109,9 @@ def gym_facts(path: Path, width: int, height: int) -> Facts:
     try:
         arrays = stacked_facts(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a safetensors file of the model gym, cannot read it ({error}).") from error
+        raise ValueError(
+            f"{path}: expected a safetensors file of the model gym, cannot read it ({error!s:.200})."
+        ) from error
 
     def facts(number: int, header: Mapping[str, Any]) -> FrameFacts:
         try:
@@ -123,6 +125,6 @@ def gym_facts(path: Path, width: int, height: int) -> Facts:
                 depth_kind="forward",
             )
         except (KeyError, IndexError) as error:
-            raise ValueError(f"{path}, frame {number}: an array is missing or too short ({error!r}).") from error
+            raise ValueError(f"{path}, frame {number}: an array is missing or too short ({error!r:.200}).") from error
 
     return facts

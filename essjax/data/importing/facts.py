@@ -132,7 +132,7 @@ def generic_facts(path: Path, width: int, height: int) -> Facts:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
-                f"{path}, frame {number}: a field is missing or has the wrong form ({error!r})."
+                f"{path}, frame {number}: a field is missing or has the wrong form ({error!r:.200})."
             ) from error
 
     return facts

@@ -13,7 +13,7 @@ from essjax.data.importing.facts import Facts, generic_facts, no_facts
 from essjax.data.importing.files import fill
 from essjax.data.importing.recipe import Recipe, load_recipe
 from essjax.data.importing.splits import Range, fit_segments, split_segments
-from essjax.data.importing.stream import Clip, OnFrame, OpenClip, Written, hint, open_clip, write_clip
+from essjax.data.importing.stream import BrokenFrame, Clip, OnFrame, OpenClip, Written, hint, open_clip, write_clip
 from essjax.data.importing.unreal import header_facts
 from essjax.data.layout import (
     Dataset,
@@ -286,7 +286,7 @@ def _first_frame(opened: OpenClip, skip_broken: bool) -> SequenceInfo:
         try:
             return writer.describe(number, clip.convert(number).content)
         except ValueError as error:
-            reasons.append(f"sequence {clip.name}, frame {number}: {error}")
+            reasons.append(f"sequence {clip.name}, frame {number}: {BrokenFrame(clip.name, number, error, '')}")
             if not skip_broken:
                 raise ValueError(f"{reasons[0]}{hint(opened, number)}") from error
     raise ValueError(f"sequence {clip.name}: all frames are broken. The first: {reasons[0]}")

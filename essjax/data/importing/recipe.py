@@ -255,7 +255,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
-        raise ValueError(f"{path}: expected a recipe in TOML, cannot read it ({error}).") from error
+        raise ValueError(f"{path}: expected a recipe in TOML, cannot read it ({error!s:.200}).") from error
 
 
 def load_recipe(preset: str, recipe: str | os.PathLike | None = None) -> Recipe:

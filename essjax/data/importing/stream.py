@@ -97,10 +97,13 @@ def _size_and_date(path: Path) -> tuple[int, int]:
 
 
 class BrokenFrame(ValueError):
-    """A frame that cannot be used, whatever the disk: ``--skip-broken`` leaves it out."""
+    """A frame that cannot be used, whatever the disk: ``--skip-broken`` leaves it out.
 
-    def __init__(self, reason: str, made_from: str):
-        super().__init__(reason)
+    Its text does not name sequence and frame, which whoever catches it does.
+    """
+
+    def __init__(self, name: str, number: int, error: ValueError, made_from: str):
+        super().__init__(str(error).removeprefix(f"sequence {name}, frame {number}").lstrip(":, "))
         self.made_from = made_from
 
 
@@ -226,7 +229,7 @@ def _commit(writer: SequenceWriter, number: int, future: Future[PreparedFrame], 
     try:
         writer.commit(prepared, cut=cut, save=save)
     except ValueError as error:
-        raise BrokenFrame(str(error), prepared.record["made_from"]) from error
+        raise BrokenFrame(writer.name, number, error, prepared.record["made_from"]) from error
     writer.skipped.pop(number, None)
 
 
@@ -251,7 +254,7 @@ def _prepared(opened: OpenClip, workers: int) -> Generator[tuple[int, Future[Pre
             converted = clip.convert(number)
             writer.describe(number, converted.content)
         except ValueError as error:
-            raise BrokenFrame(str(error), before) from error
+            raise BrokenFrame(clip.name, number, error, before) from error
         try:
             return writer.prepare(number, converted.content, notes=converted.counts, made_from=before)
         except BaseException:
