@@ -56,6 +56,7 @@ CALLS = {
     warp.gbuffer_guided_warp: (COLOR, GUIDE, GUIDE, FIELD), warp.guided_weights: (GUIDE, GUIDE, FIELD),
     warp.guides: (GBuffers(depth=PLANE, base_color=COLOR, normal=COLOR),),
     warp.hole_mask: (GBUFFERS, GBUFFERS, FIELD, BOTH), warp.inside_mask: (FIELD,),
+    warp.depth_guide: (PLANE,), warp.normals_from_depth: (PLANE,),
     warp.jitter_aligned_upsample: (IMAGE, {"scale": 1.5}, JITTER),
     warp.jittered_motion: (FIELD, JITTER, JITTER), warp.occlusion_motion: (FIELD, PLANE, PLANE),
     warp.sample: (IMAGE, LARGE_FIELD), warp.sample_by_fetches: (IMAGE, LARGE_FIELD),
@@ -66,7 +67,15 @@ CALLS = {
     warp.zero_upsample: (IMAGE, {"scale": 2}, JITTER),
 }  # fmt: skip
 """Function -> its arguments: arrays in order, others by name."""
-WITHOUT_ARRAYS = {"aggregate", "candidate_offsets", "has_source", "mean_over", "score_rollout", "vgg16_features"}
+WITHOUT_ARRAYS = {
+    "aggregate",
+    "candidate_offsets",
+    "distances",
+    "has_source",
+    "mean_over",
+    "score_rollout",
+    "vgg16_features",
+}
 
 
 def checked(function):

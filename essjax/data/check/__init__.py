@@ -5,11 +5,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from essjax.data.check.compare import total
 from essjax.data.check.continuity import ContinuityCheck, judge_continuity
+from essjax.data.check.coverage import judge_coverage
 from essjax.data.check.finding import VERDICTS, Finding, some
 from essjax.data.check.geometry import GeometryCheck, judge_geometry
-from essjax.data.check.jitter import FIXES, JitterCheck, judge_against, judge_between
+from essjax.data.check.jitter import FIXES, SHIFT, JitterCheck, judge_against, judge_between
 from essjax.data.check.motion import MotionCheck, judge_motion, look
 from essjax.data.check.pairs import Step, choose, read_step, steps
 from essjax.data.check.pictures import write_pictures
@@ -147,6 +150,8 @@ def check_dataset(
             done += 1
             progress(done, frames)
     findings = _judge_with_each_alone(checks, dataset.info)
+    jitters = [np.array([record["jitter"] for record in info.frames]) for info in dataset.sequences.values()]
+    findings.insert([finding.check for finding in findings].index(SHIFT) + 1, judge_coverage(jitters))
     written: list[Path] = []
     if pictures is not None:
         best = total(check.motion.reference for check in checks.values()).best()

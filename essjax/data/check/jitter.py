@@ -19,7 +19,8 @@ from essjax.typing import Array, Color
 from essjax.warp import inside_mask
 from essjax.warp.sampling import axis_taps
 
-ROWS = ("jitter, references", "jitter, frame to frame", "sub-pixel shift")
+SHIFT = "sub-pixel shift"
+ROWS = ("jitter, references", "jitter, frame to frame", SHIFT)
 READINGS = ("as stated", "negated", "x flipped", "y flipped", "swapped", "times 2", "times 1/2", "UV", "NDC", "none")
 """How jitter could have been meant; the first is what is stated."""
 FIXES = {
