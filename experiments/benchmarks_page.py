@@ -13,7 +13,9 @@ from typing import Any
 
 from essjax.data.json_files import write_json
 from experiments.benchmark.section import section
+from experiments.report.rows import rate_tables
 from experiments.tables import get_table, markdown
+from experiments.worth import table
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "experiments" / "results"
@@ -45,8 +47,8 @@ def keep(name: str, paths: Sequence[Path]) -> Path:
     for path, run in zip(paths, runs, strict=True):
         if run.get("schema") != 1:
             raise ValueError(f"{path}: expected schema 1, got {run.get('schema')!r}.")
-        if run.get("kind") == "tables":
-            return _keep_tables(name, paths, run)
+        if run.get("kind") in ("tables", "worth"):
+            return _keep_one(name, paths, run)
         first = _alike(runs[0])
         for field, value in _alike(run).items():
             if value != first[field]:
@@ -82,9 +84,9 @@ def _alike(run: dict[str, Any]) -> dict[str, Any]:
     return {**parts, "settings": settings, "device": environment["device"], "versions": environment["versions"]}
 
 
-def _keep_tables(name: str, paths: Sequence[Path], content: dict[str, Any]) -> Path:
+def _keep_one(name: str, paths: Sequence[Path], content: dict[str, Any]) -> Path:
     if len(paths) > 1:
-        raise ValueError(f"{name}: expected one file of tables, got {len(paths)}.")
+        raise ValueError(f"{name}: expected one file of {content['kind']}, got {len(paths)}.")
     path = RESULTS / f"{name}.json"
     write_json(path, content)
     return path
@@ -112,7 +114,7 @@ def _merge_rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def page(results: list[tuple[str, dict[str, Any]]]) -> str:
     """Make the whole page."""
-    sections = {"import": _import_section, "tables": _tables_section, "benchmark": section}
+    sections = {"import": _import_section, "tables": _tables_section, "benchmark": section, "worth": _worth_section}
     return "\n".join(
         [HEAD, *(sections.get(metrics.get("kind", ""), _section)(name, metrics) for name, metrics in results)]
     )
@@ -192,7 +194,27 @@ def _section(name: str, metrics: dict[str, Any]) -> str:
                 values = [_number(row.get(c), c) + _spread(row, c) for c in columns]
                 lines.append(f"| {row['method']} | {row['frames'].upper()} | " + " | ".join(values) + " |")
             lines.append("")
+    for rates in rate_tables(metrics):
+        body = [[method, *cells] for method, cells in rates.lines.items()]
+        lines += [f"{rates.title}:", "", *_markdown(["method", *rates.heads], body)]
     return "\n".join(lines)
+
+
+def _worth_section(name: str, content: dict[str, Any]) -> str:
+    """Show what each buffer is worth (experiments/worth.py)."""
+    heads, lines = table(content)
+    environment = content["environment"]
+    about = (
+        f"`python -m experiments.worth {content['weights']}`, {content['clips']} test clips; commit "
+        f"{environment['commit']}; {environment['device']}; jax {environment['versions']['jax']}. PSNR (in holes), by "
+        "rate and frames since the rendered one."
+    )
+    return "\n".join([f"## {name}", "", about, "", *_markdown(["played", *heads], lines)])
+
+
+def _markdown(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    rule = "|---|" + "---:|" * (len(heads) - 1)
+    return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(line)} |" for line in lines), ""]
 
 
 def _pace(training: dict[str, Any]) -> list[str]:
