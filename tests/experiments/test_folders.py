@@ -37,7 +37,7 @@ def test_commands_of_the_readme_do_not_share_a_folder():
         out = Path(options.out) if options.out else default_folder(name, options.preset, options.data)
         settings = (command, getattr(options, "variants", ""), options.data, tuple(options.overrides))
         assert folders.setdefault(out, settings) == settings, out
-    assert len(folders) == 7
+    assert len(folders) == 8
 
 
 def test_looking_at_a_folder_writes_nothing(tmp_path):
