@@ -56,7 +56,7 @@ def check_scored(dataset: Dataset, settings: Settings) -> None:
     Raises:
       ValueError: a test sequence, or a validation sequence where they are used, is all warm-up.
     """
-    for split in scored_splits(settings):
+    for split in (split for split in scored_splits(settings) if dataset.splits.get(split)):
         empty = [segment.sequence for segment in dataset.segments(split) if not _has_scored(dataset, segment, settings)]
         _refuse_empty(dataset.path, split, empty, settings)
 

@@ -37,7 +37,8 @@ def make_runners(
     members: Mapping[str, Member],
     names: Sequence[str],
     trained: Mapping[str, Trained],
-    validation: Clips,
+    clips: Clips,
+    validation: Clips | None,
     out: Path,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict[str, Runner], dict[str, Setting]]:
@@ -49,11 +50,12 @@ def make_runners(
       members: all rows, in the order of the table.
       names: those that must have a row.
       trained: owner -> what its training gave.
-      validation: for tuning.
+      clips: that will be scored.
+      validation: for tuning; None: there are none, and defaults are not tuned.
       out: folder of the run.
       on_step: called with what is being tuned.
     """
-    example = validation.outline(0).sequence
+    example = clips.outline(0).sequence
     runners, chosen = {}, {}
     kept = _read_settings(out / "tuning.json")
     frames = select_time(example.frames, 0)
@@ -61,7 +63,7 @@ def make_runners(
         method, settings = member.method, member.settings
         if method.info.native and example.native is None or row not in names and unfit(method, example):
             continue
-        if VARIANTS[row].tuned and settings.evaluation.tune:
+        if VARIANTS[row].tuned and settings.evaluation.tune and validation is not None:
             if row not in kept:
                 on_step(f"tuning {row}")
                 kept[row] = tune(lambda clamp, member=member: _clamped(member, clamp), validation)

@@ -46,6 +46,7 @@ def prepare(
     *,
     ranges: bool = False,
     native: bool = False,
+    trained: bool = True,
 ) -> Dataset:
     """Check ``data``, or render the built-in scenes into ``out / "scenes"`` (resumes; complete frames are kept).
 
@@ -56,6 +57,7 @@ def prepare(
       progress: called with frames done and in all.
       ranges: the run needs sample ranges.
       native: the run needs colour at native resolution.
+      trained: the run trains something; a test split is enough otherwise.
 
     Raises:
       ValueError: the dataset lacks a split, ranges or colour that a run needs, or was rendered with other settings.
@@ -65,23 +67,29 @@ def prepare(
     else:
         rendering, clips = rendering_of(settings, ranges=ranges), scene_clips(settings)
         dataset = generate(out / "scenes", clips, *settings.data.size, rendering=rendering, progress=progress)
-    for split in ("train", "validation", "test"):
-        if not dataset.splits.get(split):
-            raise ValueError(
-                f"{dataset.path}: a run needs the splits train, validation and test; this dataset has "
-                f"{', '.join(dataset.splits) or 'none'}. Import it again with --train, --validation and --test."
-            )
+    needed = ("train", "validation", "test") if trained else ("test",)
+    if not all(map(dataset.splits.get, needed)):
+        listed = lambda names: " and ".join(", ".join(names).rsplit(", ", 1))
+        raise ValueError(
+            f"{dataset.path}: this run needs the split{'s' * trained} {listed(needed)}; this dataset has "
+            f"{', '.join(dataset.splits) or 'none'}. Import it again with {listed(f'--{name}' for name in needed)}."
+        )
     if ranges and not dataset.info.ranges:
         raise ValueError(
             f"{dataset.path}: a classifier is trained on labels made of the ranges over all samples of each reference "
             "pixel, which this dataset does not have. Render the scenes with --ranges; imported frames have none."
         )
-    if native and not dataset.has_native("validation", "test"):
+    if native and not dataset.has_native(*evaluated_splits(dataset)):
         raise ValueError(
             f"{dataset.path}: all variants of this run work on frames at native resolution, which this dataset does "
             "not have. Render the scenes with --native; imported frames have none."
         )
     return dataset
+
+
+def evaluated_splits(dataset: Dataset) -> list[str]:
+    """List the splits that methods are run on; one without training may have no validation split."""
+    return [split for split in ("validation", "test") if dataset.splits.get(split)]
 
 
 def describe(dataset: Dataset) -> str:

@@ -158,6 +158,7 @@ def _prepare(request: Request, settings: Mapping[str, Settings], phases: Phases,
         lambda n, total: phases.show("data", n / total, f"{n}/{total}"),
         ranges=_needs_ranges(wanted),
         native=all(member.method.info.native for member in wanted),
+        trained=bool(trainings),
     )
     phases.show("data", 1.0, f"{len(dataset.sequences)} sequences")
     phases.console.print(datasets.describe(dataset), soft_wrap=True)
@@ -206,14 +207,17 @@ def _train(run: Run, phases: Phases) -> dict[str, Trained]:
 def _tune(run: Run, trained: Mapping[str, Trained], phases: Phases) -> Tuned:
     phases.show("tuning", text="reading")
     native = any(member.method.info.native for member in run.members.values())
-    native = native and run.dataset.has_native("validation", "test")
+    splits = datasets.evaluated_splits(run.dataset)
+    native = native and run.dataset.has_native(*splits)
     options = {"native": native, "ranges": _needs_ranges(run.wanted)}
     warmup = run.settings.evaluation.warmup
-    validation, clips = (Clips(run.dataset, split, warmup, **options) for split in ("validation", "test"))
+    of_split = {split: Clips(run.dataset, split, warmup, **options) for split in splits}
+    validation, clips = of_split.get("validation"), of_split["test"]
     runners, chosen = make_runners(
         run.members,
         run.request.names,
         trained,
+        clips,
         validation,
         run.request.out,
         lambda text: phases.show("tuning", text=text),

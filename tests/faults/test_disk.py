@@ -1,7 +1,6 @@
 """A disk that is full, or does not let us: one line that names the file, and what was there stays."""
 
 import contextlib
-import json
 import resource
 
 import jax
@@ -10,12 +9,11 @@ import numpy as np
 import pytest
 
 from essjax import cli
-from essjax.data import import_dataset
+from essjax.data.importing.stream import BrokenFrame
 from essjax.files import atomic, naming
 from essjax.methods import bilinear, save
 from essjax.train import Checkpoints
 from experiments import run
-from tests.data.importing.test_generic import odd, truth, write_odd  # noqa: F401  odd is a fixture
 from tests.train import tiny_run
 
 
@@ -93,15 +91,8 @@ def test_a_seed_without_end(capsys, tmp_path):
     assert output.count("\n") == 1 and not (tmp_path / "x").exists()
 
 
-def test_errors_name_sequence_and_frame_once(tmp_path, odd):  # noqa: F811
-    """As they are printed, and as they are kept in sequence.json."""
-    write_odd(tmp_path / "dump", truth(T=3), "a")
-    path = tmp_path / "dump" / "a" / "shot.json"
-    content = json.loads(path.read_text())
-    content["frames"]["9"]["jitter"] = [7, 0]
-    path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="^sequence a, frame 9: channel jitter: expected pixels in") as caught:
-        import_dataset(tmp_path / "dump", tmp_path / "out", "generic", recipe=odd)
-    assert str(caught.value).count("frame 9") == 1
-    report = import_dataset(tmp_path / "dump", tmp_path / "out", "generic", recipe=odd, skip_broken=True)
-    assert report.skipped["a"][9].startswith("channel jitter: expected pixels in")
+def test_errors_name_sequence_and_frame_once():
+    """As they are printed, and as they are kept in sequence.json: whoever catches it says where it was."""
+    error = ValueError("sequence a, frame 9: channel color: expected finite values")
+    assert str(BrokenFrame("a", 9, error, "")) == "channel color: expected finite values"
+    assert str(BrokenFrame("a", 8, error, "")) == str(error)

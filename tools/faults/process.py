@@ -39,6 +39,7 @@ class Child:
     def __init__(self, command: Callable[[], int], output: Path):
         """Start it."""
         self._output, self._began = output, time.monotonic()
+        output.write_text("")  # it may be killed before it has written anything
         self.pid = os.fork()
         if self.pid == 0:
             try:

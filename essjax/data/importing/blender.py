@@ -61,7 +61,7 @@ _SIZE = Kind(
     "two whole numbers of pixels, above 0",
     lambda value: isinstance(value, list) and len(value) == 2 and all(map(_PIXELS.fits, value)),
 )
-_FRAME = {"camera_to_world": numbers(16), "lens_mm": POSITIVE, "sensor_width_mm": POSITIVE, "jitter": numbers(2)}
+_FRAME = {"camera_to_world": numbers(16), "lens_mm": POSITIVE, "sensor_width_mm": POSITIVE, "jitter": numbers(2, 0.5)}
 
 
 def _read_meta(folder: Path) -> _Dump:

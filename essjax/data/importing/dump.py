@@ -154,7 +154,14 @@ class RecipeClip:
         else:
             stored = facts.jitter
         pixels = convert.to_pixels(stored, rule.unit, width, height, y=rule.y)
-        return convert.sample_offset(pixels, rule.sign).astype(np.float32)
+        offset = convert.sample_offset(pixels, rule.sign).astype(np.float32)
+        if not (np.abs(offset) <= 0.5).all():
+            path = fill(self.recipe.files.get("metadata", ""), self.sequence) or self.path("color", number)
+            raise ValueError(
+                f"{self.root / path}, frame {number}: jitter: expected at most half a pixel, got {offset.tolist()} "
+                f"pixels from {np.asarray(stored).tolist()} in {rule.unit}. Is that its unit ([jitter] in the recipe)?"
+            )
+        return offset
 
 
 def open_dump(

@@ -92,10 +92,11 @@ def _is_numeral(value: Any) -> bool:
 
 
 _NUMERAL = or_null(Kind("a number", _is_numeral))
+_EXPOSURE = or_null(Kind("a number above 0", lambda value: _is_numeral(value) and 0 < float(value) < math.inf))
 """Other programs write numbers as texts, too."""
 _CAMERA = {"camera_to_world": numbers(16), "focal": numbers(2), "center": numbers(2)}
 _FACTS = {
-    "jitter": numbers(2), "exposure": _NUMERAL, "cut": FLAG, "near": _NUMERAL, "far": _NUMERAL, **_CAMERA,
+    "jitter": numbers(2), "exposure": _EXPOSURE, "cut": FLAG, "near": _NUMERAL, "far": _NUMERAL, **_CAMERA,
 }  # fmt: skip
 
 

@@ -1,0 +1,41 @@
+"""Data at the edges: three frames without splits, a line of pixels, a cut on every frame."""
+
+import dataclasses
+import re
+
+import pytest
+
+from essjax.data import write_dataset, write_sequence
+from experiments import datasets
+from experiments.checks import check_scored
+from experiments.settings import make_settings
+from tests.data.test_store import sequence
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """Three frames, which an import leaves in one split."""
+    write_sequence(tmp_path / "clip", "a", sequence(T=3))
+    return write_dataset(tmp_path / "clip", {"test": ["a"]})
+
+
+def prepare(clip, tmp_path, **options):
+    return datasets.prepare(make_settings("quick"), clip, tmp_path / "out", lambda n, total: None, **options)
+
+
+def test_what_trains_nothing_needs_a_test_split_alone(clip, tmp_path):
+    """``--variant bilinear`` asked for three splits."""
+    assert prepare(clip, tmp_path, trained=False) is clip and datasets.evaluated_splits(clip) == ["test"]
+    settings = make_settings("quick", {"evaluation.warmup": 0})
+    check_scored(clip, settings)  # also with the validation that tuning would have
+    message = (
+        f"{clip.path}: this run needs the splits train, validation and test; this dataset has test. Import it again "
+        "with --train, --validation and --test."
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        prepare(clip, tmp_path, trained=True)
+    train = dataclasses.replace(clip, splits={"train": clip.splits["test"]})
+    with pytest.raises(
+        ValueError, match="this run needs the split test; this dataset has train. Import it again with --test"
+    ):
+        prepare(train, tmp_path, trained=False)
