@@ -17,7 +17,7 @@ import numpy as np
 import OpenEXR
 
 from essjax.buffers import DEPTHS, FULL_PRECISION
-from essjax.data.exr_text import readable
+from essjax.data.exr_text import is_whole, readable
 from essjax.files import atomic
 
 HALF_MAX = 65504.0
@@ -271,6 +271,6 @@ def write(path: str | os.PathLike, channels: Mapping[str, np.ndarray], *, attrib
             OpenEXR.File(header, {name: array for name, (array, _) in encoded.items()}, 0).write(str(temporary))
         except (RuntimeError, ValueError, TypeError) as error:
             raise ValueError(f"{path}: cannot write the file ({error}). Is the folder there, the disk full?") from error
-        if not temporary.is_file():
+        if not temporary.is_file() or not is_whole(temporary):
             raise ValueError(f"{path}: cannot write the file. Is the folder there, the disk full?")
     return sum(clamped for _, clamped in encoded.values())

@@ -1,10 +1,12 @@
-"""Text in EXR headers that is not UTF-8, such as an owner in Latin-1, which the OpenEXR package refuses."""
+"""What the OpenEXR package does not look at in a file's bytes: text that is not UTF-8, and whether all was written."""
 
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 _HEADER_BYTES = 1 << 20
 _MULTI_PART = 0x10  # of the second byte of the version field
@@ -25,6 +27,27 @@ def _attributes(data: bytes) -> Iterator[tuple[str, str, int, int]]:
         start = type_end + 5
         yield data[at:name_end].decode("latin-1"), data[name_end + 1 : type_end].decode("latin-1"), start, start + size
         at = start + size
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file of one part, just written, holds all its chunks.
+
+    OpenEXR's stream writes its last kilobytes when it is closed, and nobody hears of a disk that is full by then.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADER_BYTES)
+            table = list(_attributes(head))[-1][3] + 1
+            first = int.from_bytes(
+                head[table : table + 8], "little"
+            )  # the chunks begin behind the table of their places
+            file.seek(table)
+            places = np.frombuffer(file.read(first - table), "<u8")
+            file.seek(int(places.max()) + 4)
+            size = int.from_bytes(file.read(4), "little")
+            return bool(places.all()) and file.tell() + size <= path.stat().st_size
+    except (ValueError, IndexError):
+        return False
 
 
 def _is_utf8(text: bytes) -> bool:

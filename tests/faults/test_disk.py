@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from essjax import cli
+from essjax.data import exr
+from essjax.data.exr_text import is_whole
 from essjax.data.importing.stream import BrokenFrame
 from essjax.files import atomic, naming
 from essjax.methods import bilinear, save
@@ -51,6 +53,21 @@ def test_no_room_for_the_log(tmp_path):
 
     with pytest.raises(OSError, match=r"No space left on device: '.*log\.jsonl'"):
         tiny_run.run(tmp_path, on_step=on_step)
+
+
+@pytest.mark.parametrize("most", [0, 100, 340, 400])
+def test_no_room_for_the_end_of_an_image(tmp_path, most):
+    """OpenEXR writes a small file, or the last kilobytes of a large one, when it is closed, and says nothing."""
+    planes, path = {"R": np.arange(48.0).reshape(6, 8), "depth.Z": np.ones((6, 8))}, tmp_path / "a.exr"
+    exr.write(path, planes)
+    whole = path.read_bytes()
+    assert len(whole) > 410
+    with room(most), pytest.raises((ValueError, OSError), match=r"a\.exr.*(Is the disk full|disk full|too large)"):
+        exr.write(path, {name: 2 * plane for name, plane in planes.items()})
+    assert path.read_bytes() == whole and [file.name for file in tmp_path.iterdir()] == ["a.exr"]
+    with path.open("r+b") as file:
+        file.truncate(len(whole) - 1)
+    assert not is_whole(path)
 
 
 def test_errors_of_the_system_name_the_file(tmp_path):
