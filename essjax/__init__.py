@@ -14,8 +14,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "buffers", "builtin", "cameras", "color", "data", "deploy", "exposure", "files", "frames", "interfaces", "kernels",
-    "labels", "losses", "methods", "metrics", "networks", "rollout", "scenes", "stopping", "tensors", "train", "typing",
-    "warp",
+    "labels", "losses", "methods", "metrics", "networks", "rollout", "scenes", "sizes", "stopping", "tensors", "train",
+    "typing", "warp",
 ]  # fmt: skip
 
 

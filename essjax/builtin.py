@@ -20,6 +20,7 @@ from essjax.scenes import (
     split_seeds,
 )
 from essjax.scenes.sequence import USUAL
+from essjax.sizes import output_size, scale_of
 from essjax.stopping import finishing
 
 RENDERER = "essjax.scenes 4"
@@ -161,9 +162,11 @@ def generate(
 def _generate(
     out: Path, clips: Sequence[Clip], width: int, height: int, rendering: Rendering, progress: Progress
 ) -> Dataset:
-    shared = {"renderer": RENDERER, "width": width, "height": height, "scale": rendering.scale}
+    shared = {"renderer": RENDERER, "width": width, "height": height}
     shared["mip_bias"] = float(rendering.mip_bias)
     shared |= {key: value for key, value in rendering._asdict().items() if value != UNSAID.get(key, value)}
+    scale = scale_of((height, width), output_size(rendering.scale, (height, width)))
+    shared["scale"] = list(scale) if isinstance(scale, tuple) else scale  # as JSON has it
     splits: dict[str, list] = _check_request(out, clips, shared)
     done, total = 0, sum(clip.frames for clip in clips)
     so_far = lambda: f"{done + 1} of {total} frames are there. Run the same command again to resume."

@@ -23,6 +23,7 @@ from essjax.data.layout import read_dataset
 from essjax.files import atomic
 from essjax.kernels import check_platform
 from essjax.scenes import Rendering
+from essjax.sizes import Scale, check_scale, describe_scale
 from essjax.stopping import stoppable
 
 _console = Console()
@@ -37,15 +38,25 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def parse_size(text: str) -> tuple[int, int]:
+def parse_size(text: str, option: str = "--size") -> tuple[int, int]:
     """``"128x72"`` as (width, height)."""
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:
         width = height = 0
     if width < 1 or height < 1:
-        raise ValueError(f"--size: expected WIDTHxHEIGHT such as 128x72, got {text!r}.")
+        raise ValueError(f"{option}: expected WIDTHxHEIGHT such as 128x72, got {text!r}.")
     return width, height
+
+
+def parse_scale(text: str) -> Scale:
+    """``"1.5"`` or ``"1920x1080"``."""
+    if "x" in text.lower():
+        return parse_size(text, "--scale")
+    try:
+        return check_scale(float(text))
+    except ValueError as error:
+        raise ValueError(f"--scale: expected a number >= 1, or WIDTHxHEIGHT, got {text!r}.") from error
 
 
 def parse_range(text: str, option: str) -> tuple[int, int]:
@@ -75,7 +86,9 @@ def _check_folder(path: Path, option: str) -> None:
 
 def _print_dataset(dataset: Dataset) -> None:
     info = dataset.info
-    table = Table(title=f"{dataset.path}: {info.width}x{info.height} -> x{info.scale}", title_justify="left")
+    table = Table(
+        title=f"{dataset.path}: {info.width}x{info.height} -> {describe_scale(info.scale)}", title_justify="left"
+    )
     for column in ("split", "sequence", "frames", "scored from"):
         table.add_column(column)
     for split, segments in dataset.splits.items():
@@ -94,7 +107,7 @@ def scenes(
     sequences: int = 2,
     frames: int = 32,
     size: str = "128x72",
-    scale: int = 2,
+    scale: str = "2",
     spp: int = 64,
     families: str = "",
     native: bool = False,
@@ -111,7 +124,7 @@ def scenes(
       sequences: Sequences per family.
       frames: Frames per sequence.
       size: Size of the rendered frames, WIDTHxHEIGHT.
-      scale: Size of the reference over that of the frames.
+      scale: Size of the reference over that of the frames, such as 1.5, or its size, WIDTHxHEIGHT.
       spp: Samples per pixel of the reference.
       families: Only these, separated by commas; all of the split if empty.
       native: Also 1-sample frames at the reference's size, the input of native TAA.
@@ -123,7 +136,7 @@ def scenes(
     width, height = parse_size(size)
     chosen = [name.strip() for name in families.split(",")] if families else None
     clips = plan(split, sequences, frames, spp=spp, native=native, families=chosen, start=seed)
-    rendering = Rendering(scale=scale, ranges=ranges, mip_bias=mip_bias, jitter=jitter)
+    rendering = Rendering(scale=parse_scale(scale), ranges=ranges, mip_bias=mip_bias, jitter=jitter)
     with progress_bar("rendering") as progress:
         dataset = generate(out, clips, width, height, progress=progress, rendering=rendering)
     _print_dataset(dataset)

@@ -15,6 +15,7 @@ import numpy as np
 
 from essjax.buffers import BUFFERS, OPTIONAL_GBUFFERS, RANGES
 from essjax.cameras import Camera
+from essjax.sizes import Scale, Size, scale_of
 from essjax.typing import Color, Flag, Ids, Jitter, Mask, Motion, Plane, PyTree, Scalar, Vectors, pytree
 
 
@@ -104,7 +105,7 @@ class Sequence:
     Attributes:
       frames: a ``Frame`` whose leaves carry the time axis; colour of *every* frame: on frames that a schedule
         extrapolates it is a target, and ``rollout.unroll`` takes it away before the method sees the frame.
-      reference: ``[T, ..., s*H, s*W, 3]`` anti-aliased reference, unjittered.
+      reference: ``[T, ..., H', W', 3]`` anti-aliased, unjittered, of the frames' size or any larger one.
       valid: ``[T, ..., H, W, 1]`` LR, 1 where the previous position is on screen and showed the same surface; exact,
         from the renderer. None: ``warp.hole_mask`` estimates it.
       steady: ``[T, ..., H, W, 1]`` LR, 1 where the shading is known not to move against the surface (no mirror image,
@@ -121,9 +122,14 @@ class Sequence:
     ranges: SampleRanges | None = None
 
     @property
-    def scale(self) -> int:
-        """Reference size over frame size, in each dimension."""
-        return self.reference.shape[-3] // self.frames.motion.shape[-3]
+    def size(self) -> Size:
+        """The reference's (height, width)."""
+        return self.reference.shape[-3:-1]
+
+    @property
+    def scale(self) -> Scale:
+        """The reference's size over the frames', see ``sizes.scale_of``."""
+        return scale_of(frame_size(self.frames), self.size)
 
 
 @pytree
@@ -131,7 +137,7 @@ class Prediction:
     """The result of a step.
 
     Attributes:
-      image: ``[..., round(scale * H), round(scale * W), 3]`` linear HDR.
+      image: ``[..., H', W', 3]`` linear HDR, of the size that the method's scale gives (``sizes.output_size``).
       aux: named intermediates (flow, masks, features) for losses and pictures.
       state: new BatchNorm statistics when ``train``, else {}; keyed as the variables are:
         ``{entry: {"batch_stats": ...}}``.
@@ -140,6 +146,11 @@ class Prediction:
     image: Color
     aux: dict[str, PyTree] = dataclasses.field(default_factory=dict)
     state: dict[str, PyTree] = dataclasses.field(default_factory=dict)
+
+
+def frame_size(frame: Frame) -> Size:
+    """(height, width) of a frame."""
+    return frame.motion.shape[-3:-1]
 
 
 def frame_images(frame: Frame) -> dict[str, jax.Array | np.ndarray]:
@@ -289,17 +300,13 @@ def validate_frame(frame: Frame, where: str = "frame", requires: Iterable[str] =
 
 def validate_sequence(sequence: Sequence, name: str = "sequence", requires: Iterable[str] = ()) -> None:
     """``validate_frame`` for each frame; reference, masks, native frames and ranges against the frames' size."""
-    frames = sequence.frames
-    height, width = frames.motion.shape[-3:-1]
-    length = frames.motion.shape[0]
+    frames, length = sequence.frames, sequence.frames.motion.shape[0]
+    height, width = frame_size(frames)
     if sequence.reference.shape[0] != length:
         raise ValueError(f"{name}, reference: expected {length} frames, got {sequence.reference.shape[0]}.")
     high, wide = sequence.reference.shape[-3:-1]
-    if high % height or wide % width or high // height != wide // width:
-        raise ValueError(
-            f"{name}, reference: expected a whole multiple of {width}x{height}, the same in both dimensions, got "
-            f"{wide}x{high}. Render the reference at twice (or four times) the input size."
-        )
+    if high < height or wide < width:
+        raise ValueError(f"{name}, reference: expected at least the frames' {width}x{height}, got {wide}x{high}.")
     for mask_name in ("valid", "steady"):
         mask = getattr(sequence, mask_name)
         if mask is not None and mask.shape[-3:] != (height, width, 1):

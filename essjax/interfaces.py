@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.frames import Frame, Prediction, rendered_color, without_color
+from essjax.sizes import Scale
 from essjax.typing import Array, Callable, Flag, Key, PyTree, pytree
 
 
@@ -43,7 +44,7 @@ class MethodInfo(NamedTuple):
 
     Attributes:
       name: as in ``--variant``.
-      scale: output size over input size: 2 or 4 for supersamplers, 1 otherwise.
+      scale: how much larger its output is than its input, see ``sizes.check_scale``; 1 where it supersamples nothing.
       latency: frames by which step n's image lags behind frame n (interpolation: 1).
       requires: names of the buffers its frames must have, besides colour and motion.
       predicts: the kinds of frames it is scored on: "ss" (rendered), "ess" (extrapolated).
@@ -52,7 +53,7 @@ class MethodInfo(NamedTuple):
     """
 
     name: str
-    scale: float
+    scale: Scale
     latency: int = 0
     requires: frozenset[str] = frozenset()
     predicts: frozenset[str] = frozenset({"ss", "ess"})

@@ -6,6 +6,7 @@ from pathlib import Path
 from essjax.data import Dataset, Segment
 from essjax.interfaces import MethodInfo
 from essjax.scenes import make_scene
+from essjax.sizes import Size, describe_scale, output_size, scale_of
 from experiments.datasets import scene_clips
 from experiments.evaluate import scored_frames
 from experiments.members import Member
@@ -20,10 +21,12 @@ def check_settings(members: Sequence[Member]) -> None:
       ValueError: the crop is too small, a variant has another scale, or a sequence has no frame that is scored.
     """
     settings = members[0].settings
+    size = settings.data.size[::-1]
+    output = output_size(settings.data.scale, size)
     for member in members:
         for stage in member.stages:
             check_crop(stage.settings, *settings.data.size, settings.data.scale)
-        reason = unfit_scale(member.method.info, settings.data.scale)
+        reason = unfit_scale(member.method.info, size, output)
         if reason:
             raise ValueError(f"{member.name}: {reason}. Set data.scale, or leave it out.")
     clips = scene_clips(settings)
@@ -43,7 +46,7 @@ def check_dataset(members: Sequence[Member], dataset: Dataset) -> None:
     """
     check_scored(dataset, members[0].settings)
     for member in members:
-        reason = unfit(member.method.info, {"motion", *dataset.info.channels}, dataset.info.scale)
+        reason = unfit(member.method.info, {"motion", *dataset.info.channels}, dataset.info.size, dataset.info.output)
         if reason:
             raise ValueError(f"{dataset.path}: {member.name} cannot run on it: {reason}. Leave it out, or import more.")
         for stage in member.stages:
@@ -82,22 +85,31 @@ def _refuse_empty(where: str | Path, split: str, empty: Sequence[str], settings:
         )
 
 
-def unfit(info: MethodInfo, images: Iterable[str], scale: int) -> str:
+def unfit(info: MethodInfo, images: Iterable[str], size: Size, output: Size) -> str:
     """Why a method cannot be run and scored on frames that hold ``images``, or an empty string.
 
     Args:
       info: of the method.
       images: names of what a frame holds.
-      scale: reference size over frame size.
+      size: (height, width) of the frames.
+      output: of the references.
     """
     missing = sorted(info.requires - set(images))
     if missing:
         return f"this dataset has no {', '.join(missing)}"
-    return unfit_scale(info, scale)
+    return unfit_scale(info, size, output)
 
 
-def unfit_scale(info: MethodInfo, scale: int) -> str:
-    """Why the scale of a method is not that of the data, or an empty string."""
-    if info.scale not in (1, scale):
-        return f"it enlarges {info.scale:g} times, this dataset's reference is {scale} times larger"
+def unfit_scale(info: MethodInfo, size: Size, output: Size) -> str:
+    """Why the output of a method has not the size of the data's references, or an empty string."""
+    (high, wide), of_data = output, describe_scale(scale_of(size, output))
+    try:
+        own = output_size(info.scale, size)
+    except ValueError as error:
+        return str(error)
+    if info.scale != 1 and own != output:
+        return (
+            f"its output ({describe_scale(info.scale)}) is {own[1]}x{own[0]}, this dataset's reference ({of_data}) is "
+            f"{wide}x{high}"
+        )
     return ""

@@ -9,7 +9,7 @@ import jax
 
 from essjax.data.json_files import NUMBER, TEXT, check, read_json, write_json
 from essjax.frames import Sequence as FrameSequence
-from essjax.frames import frame_images, select_time
+from essjax.frames import frame_images, frame_size, select_time
 from essjax.interfaces import Method, MethodInfo
 from essjax.typing import PyTree
 from experiments import checks
@@ -85,7 +85,7 @@ def _clamped(member: Member, clamp: str) -> Method:
 
 def unfit(method: Method, sequence: FrameSequence) -> str:
     """Why ``method`` cannot be run and scored on ``sequence``, or an empty string."""
-    return checks.unfit(method.info, frame_images(sequence.frames), sequence.scale)
+    return checks.unfit(method.info, frame_images(sequence.frames), frame_size(sequence.frames), sequence.size)
 
 
 def _read_settings(path: Path) -> dict[str, Setting]:
@@ -97,25 +97,28 @@ def _read_settings(path: Path) -> dict[str, Setting]:
     return {row: Setting(*(setting[name] for name in fields)) for row, setting in content.items()}
 
 
-def table_references(runners: Mapping[str, Runner], scale: int) -> dict[str, str]:
-    """Rows that are not on equal terms with methods that extrapolate every other LR frame, and why."""
-    reasons = {row: unequal(runner.method.info, scale) for row, runner in runners.items()}
+def table_references(runners: Mapping[str, Runner], pixels: float) -> dict[str, str]:
+    """Rows that are not on equal terms with methods that extrapolate every other LR frame, and why.
+
+    ``pixels``: those of the reference over those of the frame.
+    """
+    reasons = {row: unequal(runner.method.info, pixels) for row, runner in runners.items()}
     return {row: reason for row, reason in reasons.items() if reason}
 
 
-def unequal(info: MethodInfo, scale: int) -> str:
+def unequal(info: MethodInfo, pixels: float) -> str:
     """Say what a method gets that others do not (more pixels, a later frame); an empty string if nothing.
 
     Args:
       info: of the method.
-      scale: reference size over frame size.
+      pixels: those of the reference over those of the frame.
     """
     reasons = []
-    times = (2 if info.renders_all else 1) * (scale**2 if info.native else 1)
+    times = (2 if info.renders_all else 1) * (pixels if info.native else 1)
     if times > 1:
         frames = "every frame rendered" if info.renders_all else "rendered frames"
         where = " at native resolution" if info.native else ""
-        reasons.append(f"gets {frames}{where}: {_TIMES.get(times, f'{times} times')} the input")
+        reasons.append(f"gets {frames}{where}: {_TIMES.get(times, f'{times:.3g} times')} the input")
     if info.latency:
         reasons.append(f"+{info.latency} frame of latency: it interpolates; frames without a later one are not scored")
     return "; ".join(reasons)

@@ -99,5 +99,5 @@ def describe(dataset: Dataset) -> str:
     for split, segments in dataset.splits.items():
         frames = sum(len(dataset.numbers(segment)) for segment in segments)
         parts.append(f"{split} {len(segments)} sequences, {frames} frames")
-    size = f"{info.width}x{info.height} -> {info.width * info.scale}x{info.height * info.scale}"
+    size = f"{info.width}x{info.height} -> {info.output[1]}x{info.output[0]}"
     return f"{size}; {'; '.join(parts)}"

@@ -17,12 +17,13 @@ from essjax.color import display, expose
 from essjax.data import Dataset, Segment, read_segment
 from essjax.data.memory import Kept
 from essjax.exposure import clip_exposure
-from essjax.frames import Frame, Sequence, background, rendered_color
+from essjax.frames import Frame, Sequence, background, frame_size, rendered_color
 from essjax.interfaces import Method, expand_flag
 from essjax.metrics import aggregate, distances, has_source, mean_over, psnr, score_rollout
 from essjax.rollout import ESS, SS, Schedule, alternate, every, stream
+from essjax.sizes import ratios
 from essjax.typing import Array, PyTree
-from essjax.warp import hole_mask, jittered_motion, sample, upsample_motion
+from essjax.warp import hole_mask, jittered_motion, nearest_upsample, sample, upsample_motion
 
 EXTRA_METRICS = ("psnr_foreground", "psnr_reference")
 """Columns beside ``METRICS``: without the background (for LR results), and LR against the reference at the sample
@@ -171,10 +172,11 @@ def runs_at(method: Method, rate: int, first: int) -> bool:
     return rate == first if method.info.renders_all else rate == 2 or not method.info.latency
 
 
-@functools.partial(jax.jit, static_argnames="scale")
-def reference_at_samples(reference: Array, frames: Frame, scale: int) -> Array:
+@jax.jit
+def reference_at_samples(reference: Array, frames: Frame) -> Array:
     """Read the reference where each LR sample was taken, ``[T, H, W, 3]``."""
-    positions = scale * pixel_positions(frames.motion.shape[-3], frames.motion.shape[-2], frames.jitter)
+    size = frame_size(frames)
+    positions = jnp.asarray(ratios(size, reference.shape[-3:-1]), jnp.float32) * pixel_positions(*size, frames.jitter)
     return jnp.maximum(sample(reference, positions, mode="bilinear"), 0.0)
 
 
@@ -187,7 +189,7 @@ def score_clip(
     method: Method, clip: Clip, images: np.ndarray, kinds: tuple[str, ...], rate: int = 2
 ) -> list[dict[str, Any]]:
     """One row per scored frame of a kind that the method predicts; without those that it cannot show."""
-    frames, scale = clip.sequence.frames, clip.sequence.scale
+    frames, size = clip.sequence.frames, clip.sequence.size
     low = images.shape[1:3] == frames.motion.shape[1:3] and not method.info.native
     foreground = ~np.asarray(background(frames.gbuffers))
     if low:
@@ -196,8 +198,8 @@ def score_clip(
         motion = jittered_motion(frames.motion, frames.jitter, previous)
     else:
         targets = np.asarray(clip.sequence.reference)
-        holes, foreground = (np.repeat(np.repeat(m, scale, 1), scale, 2) for m in (clip.holes, foreground))
-        motion = upsample_motion(frames.motion, scale, jitter=frames.jitter)
+        holes, foreground = (np.asarray(nearest_upsample(m, size)) for m in (clip.holes, foreground))
+        motion = upsample_motion(frames.motion, size, jitter=frames.jitter)
     # All frames, so that every sequence has the same shape and compiles once; the warm-up is dropped below.
     everything = list(range(len(kinds)))
     rows = score_rollout(
@@ -213,7 +215,7 @@ def score_clip(
     )
     extra = {"psnr_foreground": _masked_psnr(images, targets, clip.exposure, foreground)}
     if low:
-        at_samples = reference_at_samples(clip.sequence.reference, frames, scale)
+        at_samples = reference_at_samples(clip.sequence.reference, frames)
         extra["psnr_reference"] = _masked_psnr(images, at_samples, clip.exposure, foreground)
     extra = {name: np.asarray(values) for name, values in extra.items()}
     ages = distances(kinds)
@@ -327,7 +329,8 @@ def _collect_picture(
 
 
 def _new_picture(clip: Clip, n: int, kind: str, low: bool, rate: int) -> dict[str, Any]:
-    frames, scale = clip.sequence.frames, 1 if low else clip.sequence.scale
+    frames = clip.sequence.frames
+    size = frame_size(frames) if low else clip.sequence.size
     rendered = rendered_color(frames, "the report")
     target = rendered if low else clip.sequence.reference
     # What was rendered last: this frame, or one before where this one is extrapolated, the farthest that there is.
@@ -342,7 +345,7 @@ def _new_picture(clip: Clip, n: int, kind: str, low: bool, rate: int) -> dict[st
         picture["previous"] = {}
         del frames_of_part["previous"]
     for part, (frame, index) in frames_of_part.items():
-        color = np.repeat(np.repeat(np.asarray(rendered[max(index, 0)]), scale, 0), scale, 1)
+        color = np.asarray(nearest_upsample(np.asarray(rendered[max(index, 0)]), size))
         picture[part] = {"input": color, "reference": np.array(target[max(frame, 0)])}
     return picture
 

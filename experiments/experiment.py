@@ -7,6 +7,7 @@ off.
 import contextlib
 import dataclasses
 import itertools
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -139,9 +140,11 @@ def _prepare(request: Request, settings: Mapping[str, Settings], phases: Phases,
     """Resolve the members, read or render the data, refuse what does not fit."""
     phases.show("data", text="reading" if request.data else "rendering")
     opened = read_dataset(request.data) if request.data is not None else None
-    if opened:  # labels depend on the size of the image: a user's data has its own
-        size = opened.info.width, opened.info.height
-        settings = {name: with_data(own, size=size) for name, own in settings.items()}
+    if opened:  # labels and outputs depend on the sizes of the images: a user's data has its own
+        found: dict[str, Any] = {"size": (opened.info.width, opened.info.height)}
+        if opened.info.scale != 1:  # else it has no references: what supersamples is refused
+            found["scale"] = opened.info.scale
+        settings = {name: with_data(own, **found) for name, own in settings.items()}
     members = resolve(settings, request.preset, request.out)
     wanted, steps = [members[name] for name in request.names], None
     if opened is None:
@@ -298,7 +301,7 @@ def _report(
         metrics.setdefault(VARIANTS[name].key, {})[name] = found.scores
     if evaluated.holes:
         metrics["hole_mask"] = evaluated.holes
-    references = table_references(tuned.runners, run.dataset.info.scale)
+    references = table_references(tuned.runners, math.prod(run.dataset.info.output) / math.prod(run.dataset.info.size))
     urgent = [f"Dead network: {text}" for text in evaluated.dead] + [f"Warning: {text}" for text in metrics["warnings"]]
     outlines = [tuned.clips.outline(n) for n in range(len(tuned.clips))]
     remarks = [*urgent, *health.training_note(reports), *notes(run.members, names, outlines, tuned.chosen)]
@@ -344,8 +347,8 @@ def costs(runners: Mapping[str, Runner], dataset: Dataset) -> dict[str, dict[str
     """Count, method by method, parameters, multiply-adds of each kind of frame at the dataset's size, latency."""
     found = {}
     for name, runner in runners.items():
-        enlarged = dataset.info.scale if runner.method.info.native else 1
-        cost = method_cost(runner.method, dataset.info.width * enlarged, dataset.info.height * enlarged)
+        height, width = dataset.info.output if runner.method.info.native else dataset.info.size
+        cost = method_cost(runner.method, width, height)
         found[name] = cost._asdict()
     return found
 

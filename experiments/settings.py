@@ -24,13 +24,14 @@ Table = Mapping[str, tuple[Any, Any, Any]]
 class Data:
     """Scenes to render; ignored with ``--data``. Lengths in frames, sizes in LR pixels, sequences per family.
 
+    scale: reference size over ``size``, any number >= 1, or the reference's (width, height).
     ``train_spp`` is also validation's, ``test_frames`` too. mip_bias (thesis 002): 0 for its dataset 1, -1 for its
     dataset 2. jitter: "dlctus" where every frame is rendered. fresh: new train scenes after so many steps, rendered in
     the meantime; None: always those on disk.
     """
 
     size: tuple[int, int]
-    scale: int
+    scale: float | tuple[int, int]
     train_sequences: int
     validation_sequences: int
     test_sequences: int
@@ -335,7 +336,8 @@ def _check_number(path: str, number: float, *, is_int: bool) -> None:
 
 
 _BOUNDS = {
-    "seed": (0, 2**31), "train_frames": (2, math.inf), "test_frames": (2, math.inf), "clip": (2, math.inf),
+    "seed": (0, 2**31), "scale": (1, math.inf),
+    "train_frames": (2, math.inf), "test_frames": (2, math.inf), "clip": (2, math.inf),
     "rates": (2, 9), "mip_bias": (-math.inf, math.inf), "average": (0, 1), "warmup": (0, math.inf),
     "pictures": (0, math.inf),
 }  # fmt: skip

@@ -18,6 +18,7 @@ from essjax.builtin import RENDERER, live_source
 from essjax.data import CachedSource, Mixed, Rounds, Source, clips, disk_source, successive_clips, without_buffers
 from essjax.data.layout import Dataset
 from essjax.frames import Sequence, select_time
+from essjax.sizes import Scale, crop_steps, output_size, ratios
 from essjax.train import (
     OPTIMIZERS,
     Checkpoints,
@@ -56,13 +57,20 @@ class Watcher:
         """Hear that a validation begins (no scores), or is done."""
 
 
-def check_crop(settings: StageSettings, width: int, height: int, scale: int) -> tuple[int, int]:
+def check_crop(settings: StageSettings, width: int, height: int, scale: Scale) -> tuple[int, int]:
     """Width and height of the crops that are cut out of frames of ``width`` x ``height``, of a reference by ``scale``.
+
+    A square in output pixels becomes a multiple of the ratio's denominators.
 
     Raises:
       ValueError: they are too small.
     """
-    wanted = settings.crop if isinstance(settings.crop, tuple) else 2 * (settings.crop // scale,)
+    wanted = settings.crop
+    if not isinstance(wanted, tuple):
+        output = output_size(scale, (height, width))
+        sides = [int(wanted // ratio) for ratio in ratios((height, width), output)]
+        down, across = crop_steps((height, width), output) or (1, 1)
+        wanted = sides[0] - sides[0] % across, sides[1] - sides[1] % down
     crop = min(wanted[0], width), min(wanted[1], height)
     if min(crop) < MIN_CROP:
         raise ValueError(

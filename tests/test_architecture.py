@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LEVELS = {
     "essjax.typing": 0, "essjax.buffers": 0, "essjax.files": 0, "essjax.stopping": 0,
-    "essjax.cameras": 1, "essjax.kernels": 1, "essjax.color": 1, "essjax.tensors": 1,
+    "essjax.cameras": 1, "essjax.kernels": 1, "essjax.color": 1, "essjax.tensors": 1, "essjax.sizes": 1,
     "essjax.frames": 2,
     "essjax.interfaces": 3, "essjax.warp": 3,
     "essjax.exposure": 4, "essjax.losses": 4, "essjax.networks": 4, "essjax.labels": 4,

@@ -9,7 +9,7 @@ import numpy as np
 
 from essjax.buffers import BUFFERS, OPTIONAL_GBUFFERS, RANGES
 from essjax.cameras import Camera
-from essjax.frames import Frame, SampleRanges, Sequence, frame_images, gbuffers_of
+from essjax.frames import Frame, SampleRanges, Sequence, frame_images, frame_size, gbuffers_of
 
 _AXES = {"horizontal": 0, "vertical": 1}
 _MIRRORED = {name: buffer.channels for name, buffer in BUFFERS.items() if buffer.directed}
@@ -69,14 +69,23 @@ def crop_images(sequence: Sequence, top: int, left: int, height: int, width: int
       left: first column, LR pixels.
       height: LR pixels.
       width: LR pixels.
+
+    Raises:
+      ValueError: the reference's part is no whole number of pixels.
     """
-    scale = sequence.scale
+    (down, across), (high, wide) = frame_size(sequence.frames), sequence.size
 
     def small(image: Any) -> Any:
         return _window(image, top, left, height, width)
 
+    if any(side * wide % across for side in (left, width)) or any(side * high % down for side in (top, height)):
+        raise ValueError(
+            f"crop: {width}x{height} at ({left}, {top}) of frames of {across}x{down} is no whole number of pixels of a "
+            f"reference of {wide}x{high}. Crop at multiples of the ratio's denominators."
+        )
+
     def enlarged(image: Any) -> Any:
-        return _window(image, scale * top, scale * left, scale * height, scale * width)
+        return _window(image, top * high // down, left * wide // across, height * high // down, width * wide // across)
 
     return Sequence(
         frames=_map_images(sequence.frames, lambda _, image: small(image)),
@@ -111,7 +120,7 @@ def crop(sequence: Sequence, top: int, left: int, height: int, width: int) -> Se
       width: LR pixels.
 
     Raises:
-      ValueError: the window does not fit.
+      ValueError: the window does not fit, or the reference's part is no whole number of pixels.
     """
     rows, columns = sequence.frames.motion.shape[-3:-1]
     if not (0 <= top <= rows - height and 0 <= left <= columns - width and height > 0 and width > 0):

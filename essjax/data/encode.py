@@ -48,10 +48,10 @@ def describe(content: Sequence, name: str, source: Mapping[str, Any]) -> Sequenc
     """
     shape = content.reference.shape
     height, width = content.frames.motion.shape[-3:-1]
-    scale = shape[0] // height
-    if shape != (scale * height, scale * width, 3) or scale < 1:
+    if len(shape) != 3 or shape[0] < height or shape[1] < width or shape[2] != 3:
         raise ValueError(
-            f"sequence {name}, reference: expected [s*{height}, s*{width}, 3] with a whole s, got {tuple(shape)}."
+            f"sequence {name}, reference: expected [H, W, 3], at least {height} and {width} as the frames, "
+            f"got {tuple(shape)}."
         )
     native = content.native
     if native is not None and native.motion.shape != (*shape[:2], 2):
@@ -62,7 +62,7 @@ def describe(content: Sequence, name: str, source: Mapping[str, Any]) -> Sequenc
     present = _images(content)
     channels = tuple(suffix for suffix in SUFFIXES if suffix in present)
     ranges = content.ranges is not None
-    return SequenceInfo(name, width, height, scale, channels, native is not None, source, ranges=ranges)
+    return SequenceInfo(name, width, height, content.scale, channels, native is not None, source, ranges=ranges)
 
 
 def _images(content: Sequence) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from essjax.data.importing.convert import halton
 from essjax.data.importing.draft import CERTAIN, LIKELY, UNKNOWN, Draft, make_draft
 from essjax.data.importing.inventory import Inventory, take_stock
 from essjax.data.layout import Dataset
+from essjax.sizes import Size, ratios
 from essjax.warp import inside_mask
 
 FRAMES = 8
@@ -66,16 +67,17 @@ class _Reading(NamedTuple):
     factor: np.ndarray
 
 
-def _readings(width: int, height: int, scale: int) -> list[_Reading]:
+def _readings(size: Size, output: Size) -> list[_Reading]:
+    height, width = size
     units = {
         "pixels": ({"unit": "pixels"}, (1.0, 1.0)),
         "uv": ({"unit": "uv"}, (width, height)),
         "ndc": ({"unit": "ndc"}, (width / 2, height / 2)),
         "twice": ({"unit": "uv", "scale": 2.0}, (2 * width, 2 * height)),
     }
-    if scale > 1:
-        big = {"unit": "pixels", "resolution": [width * scale, height * scale]}
-        units["reference"] = (big, (1 / scale, 1 / scale))
+    if output != size:
+        along_x, along_y = ratios(size, output)
+        units["reference"] = ({"unit": "pixels", "resolution": [output[1], output[0]]}, (1 / along_x, 1 / along_y))
     found = []
     for (keys, factor), sign, up, swapped in itertools.product(units.values(), (1, -1), (False, True), (False, True)):
         keys = {**keys, "sign": "previous-current" if sign > 0 else "current-previous", "y": "up" if up else "down"}
@@ -132,7 +134,7 @@ def _imported(dump: Path, draft: Draft) -> Iterator[Dataset]:
 def _find_motion(draft: Draft, dataset: Dataset, frames: list[Step]) -> None:
     """Set sign, axes and unit of motion to what explains the pictures best."""
     info = dataset.info
-    readings = _readings(info.width, info.height, info.scale)
+    readings = _readings(info.size, info.output)
     names = tuple(map(str, range(len(readings))))
     own, guided, rendered = (Comparison(names) for _ in range(3))
     for step in frames:
@@ -147,10 +149,7 @@ def _find_motion(draft: Draft, dataset: Dataset, frames: list[Step]) -> None:
         regions = regions_of(step)
         zero = np.zeros(2, np.float32)
         if info.source.get("reference") != "color":
-            errors = [
-                warp_errors(step.reference_before, step.reference, m, zero, step.key, scale=step.scale)[..., 0]
-                for m in motions
-            ]
+            errors = [warp_errors(step.reference_before, step.reference, m, zero, step.key)[..., 0] for m in motions]
             own.add(np.stack(errors), motions, usable, regions)
         else:
             rendered.add(np.stack([rendered_errors(step, m) for m in motions]), motions, usable, regions)

@@ -54,6 +54,17 @@ NUMBER = Kind("a number", _is_number)
 POSITIVE = Kind("a number above 0", lambda value: _is_number(value) and value > 0)
 
 
+SIDE = whole(1, 1 << 16)
+SCALE = Kind(
+    "a number in 1..64 or [width, height]",
+    lambda value: (
+        len(value) == 2 and all(map(SIDE.fits, value))
+        if isinstance(value, list)
+        else POSITIVE.fits(value) and 1 <= value <= 64
+    ),
+)
+
+
 def _flat(value: Any) -> Iterable[Any]:
     """Numbers of lists in lists, two deep."""
     for part in value:

@@ -26,6 +26,8 @@ from essjax.data.json_files import (
     NAME,
     OBJECT,
     POSITIVE,
+    SCALE,
+    SIDE,
     TEXT,
     Kind,
     check,
@@ -37,6 +39,7 @@ from essjax.data.json_files import (
     whole,
     write_json,
 )
+from essjax.sizes import Scale, Size, output_size
 
 SCHEMA = 1
 SUFFIXES = {**{name: buffer.suffixes for name, buffer in BUFFERS.items()}, **dict.fromkeys(MASKS, "Y")}
@@ -75,7 +78,8 @@ class SequenceInfo:
       name: of the sequence and its folder.
       width: of its frames, pixels.
       height: of its frames, pixels.
-      scale: reference size over frame size.
+      scale: reference size over frame size: a number, or the reference's (width, height) where its sides differ in that
+        (in JSON a list of both).
       channels: the images in every ``lr`` file, as in ``SUFFIXES``.
       native: whether there are ``native`` files.
       ranges: whether there are ``ranges`` files.
@@ -91,7 +95,7 @@ class SequenceInfo:
     name: str
     width: int
     height: int
-    scale: int
+    scale: Scale
     channels: tuple[str, ...]
     native: bool
     source: Mapping[str, Any]
@@ -99,6 +103,16 @@ class SequenceInfo:
     complete: bool = False
     ranges: bool = False
     skipped: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def size(self) -> Size:
+        """(height, width) of the frames."""
+        return self.height, self.width
+
+    @property
+    def output(self) -> Size:
+        """(height, width) of the references."""
+        return output_size(self.scale, self.size)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -187,7 +201,7 @@ _CHANNELS = Kind(
     ),
 )
 _SEQUENCE = {
-    "name": NAME, "width": whole(1, 1 << 16), "height": whole(1, 1 << 16), "scale": whole(1, 64), "native": FLAG,
+    "name": NAME, "width": SIDE, "height": SIDE, "scale": SCALE, "native": FLAG,
     "channels": _CHANNELS,
     "ranges": FLAG, "source": OBJECT, "frames": LIST, "complete": FLAG, "skipped": LIST,
 }  # fmt: skip
@@ -237,7 +251,10 @@ def read_sequence_info(root: str | os.PathLike, name: str) -> SequenceInfo:
         if len({record.get(key) is None for record in content["frames"]}) > 1:
             raise ValueError(f"{path}: {key}: expected a value for all frames, or null for all; the file is damaged.")
     fields = {key: tuple(value) if isinstance(value, list) else value for key, value in content.items()}
-    return SequenceInfo(**{field.name: fields[field.name] for field in dataclasses.fields(SequenceInfo)})
+    info = SequenceInfo(**{field.name: fields[field.name] for field in dataclasses.fields(SequenceInfo)})
+    if isinstance(info.scale, tuple) and (info.scale[0] < info.width or info.scale[1] < info.height):
+        raise ValueError(f"{path}: scale: expected at least the frames' size, got {shown(content['scale'])}.")
+    return info
 
 
 def write_sequence_info(root: str | os.PathLike, info: SequenceInfo) -> None:
@@ -379,14 +396,3 @@ def read_dataset(path: str | os.PathLike) -> Dataset:
         for segment in segments:
             _check_segment(file, split, segment, sequences)
     return Dataset(root, source, sequences, resolved)
-
-
-def stack_planes(channels: Mapping[str, np.ndarray], image: str) -> np.ndarray:
-    """``[H, W, C]`` float32 (ids int32) from the planes of one image."""
-    dtype = np.int32 if image == "stencil" else np.float32
-    return np.stack([channels[name] for name in channel_names(image)], axis=-1).astype(dtype)
-
-
-def split_planes(image: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Inverse of ``stack_planes``: planes by channel name."""
-    return {name: values[..., i] for i, name in enumerate(channel_names(image))}

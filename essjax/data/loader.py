@@ -17,7 +17,8 @@ from essjax.data.augment import crop_images, crop_origin, flip, start_with_cut
 from essjax.data.layout import Dataset
 from essjax.data.memory import Kept
 from essjax.data.read import read_frame, select_records
-from essjax.frames import Sequence, select_time
+from essjax.frames import Sequence, frame_size, select_time
+from essjax.sizes import MAX_STEP, Size, crop_steps
 
 
 class Source(Protocol):
@@ -87,11 +88,11 @@ class DiskSource:
         """Bool ``[T]``: which frames of sequence ``index`` are cuts; the first one always is."""
         return np.array([n == 0 or bool(record.get("cut")) for n, record in enumerate(self._records[index])])
 
-    def outline(self, index: int) -> tuple[int, int, Any]:
-        """Height and width of the frames of sequence ``index``, and what it must have in common with the others."""
+    def outline(self, index: int) -> tuple[Size, Size, Any]:
+        """Sizes of the frames and references of sequence ``index``, and what it must have in common with the others."""
         info, records = self._dataset.info, self._records[index]
         optional = {(record.get("camera") is None, record.get("exposure") is None) for record in records}
-        return info.height, info.width, optional
+        return info.size, info.output, optional
 
     def window(self, index: int, start: int, length: int, box: tuple[int, int, int, int] | None = None) -> Sequence:
         """Return what slicing sequence ``index`` in time, then ``crop``, gives, bit by bit; only these frames are read.
@@ -163,33 +164,51 @@ def windows(source: Source, length: int) -> list[tuple[int, int]]:
     return found
 
 
-def _outline(source: Source, index: int) -> tuple[int, int, Any]:
-    """Height and width of the frames of a sequence, and what all sequences must have in common."""
+def _outline(source: Source, index: int) -> tuple[Size, Size, Any]:
+    """(height, width) of the frames and references of a sequence, and what all sequences must have in common."""
     if isinstance(source, DiskSource):
         return source.outline(index)
     sequence = dataclasses.replace(source[index], native=None)
     shape = sequence.frames.motion.shape
     if len(shape) != 4:
         raise ValueError(f"clips: expected sequences [T, H, W, C], got motion {shape} in sequence {index}.")
-    return shape[1], shape[2], (sequence.scale, jax.tree.structure(sequence))
+    return frame_size(sequence.frames), sequence.size, (sequence.scale, jax.tree.structure(sequence))
 
 
 def check_alike(source: Source, crop: tuple[int, int] | None) -> None:
     """All sequences must hold the same buffers at the same scale, and be of one size or fit the crop."""
     first = _outline(source, 0)
     for index in range(len(source)):
-        height, width, kind = _outline(source, index)
+        (height, width), output, kind = _outline(source, index)
         if crop is not None and (crop[0] > height or crop[1] > width or min(crop) < 1):
             raise ValueError(
                 f"clips: a crop of {crop[1]}x{crop[0]} does not fit into sequence {index} of {width}x{height}."
             )
-        if crop is None and (height, width) != first[:2]:
+        if crop is not None and crop != (height, width):
+            _check_crop(crop, (height, width), output, index)
+        if crop is None and (height, width) != first[0]:
             raise ValueError(f"clips: sequence {index} has another size than sequence 0. Give a crop that fits both.")
         if kind != first[2]:
             raise ValueError(
                 f"clips: sequence {index} has another scale or other buffers than sequence 0, or only one of them has "
                 "cameras or an exposure."
             )
+
+
+def _check_crop(crop: Size, size: Size, output: Size, index: int) -> None:
+    """Raise a ValueError unless the reference's part of every crop of these frames can be a whole number of pixels."""
+    steps = crop_steps(size, output)
+    where = f"clips: sequence {index} of {size[1]}x{size[0]} with references of {output[1]}x{output[0]}"
+    if steps is None:
+        raise ValueError(
+            f"{where}: crops need a ratio with denominators of at most {MAX_STEP}, such as 1.5 or 4/3. Train on whole "
+            "frames (no crop), or on data of another ratio."
+        )
+    if any(side % step and side != whole for side, step, whole in zip(crop, steps, size, strict=True)):
+        raise ValueError(
+            f"{where}: expected a crop of multiples of {steps[1]}x{steps[0]}, so that the reference's part is whole, "
+            f"got {crop[1]}x{crop[0]}."
+        )
 
 
 def _cut_out(source: Source, index: int, start: int, length: int, box: tuple[int, int, int, int] | None) -> Sequence:
@@ -215,9 +234,14 @@ def draw_view(
     source: Source, index: int, crop: tuple[int, int] | None, flips: bool, random: np.random.Generator
 ) -> View:
     """Draw a view of sequence ``index``: ``crop`` (height, width) anywhere in its frames, mirrored or not."""
-    height, width, _ = _outline(source, index)
+    (height, width), output, _ = _outline(source, index)
     size = crop or (height, width)
-    top, left = random.integers(0, height - size[0] + 1), random.integers(0, width - size[1] + 1)
+    # At multiples of the ratio's denominator, so that the reference's part is whole.
+    steps = (1, 1) if size == (height, width) else crop_steps((height, width), output) or (1, 1)
+    top, left = (
+        step * random.integers(0, (whole - side) // step + 1)
+        for whole, side, step in zip((height, width), size, steps, strict=True)
+    )
     chosen = random.random(2) < 0.5
     directions = zip(("horizontal", "vertical"), chosen, strict=True)
     box = None if size == (height, width) else (int(top), int(left), *size)

@@ -12,7 +12,7 @@ from essjax.buffers import MASKS, RANGES
 from essjax.cameras import Camera
 from essjax.data import exr
 from essjax.data.augment import start_with_cut
-from essjax.data.layout import Dataset, Segment, SequenceInfo, channel_names, frame_path, stack_planes, whole
+from essjax.data.layout import Dataset, Segment, SequenceInfo, channel_names, frame_path, whole
 from essjax.frames import Frame, SampleRanges, Sequence, gbuffers_of
 
 
@@ -26,11 +26,17 @@ def _sized(path: Path, channels: dict[str, np.ndarray], width: int, height: int)
     return channels
 
 
+def _stack_planes(channels: Mapping[str, np.ndarray], image: str) -> np.ndarray:
+    """``[H, W, C]`` float32 (ids int32) from the planes of one image."""
+    dtype = np.int32 if image == "stencil" else np.float32
+    return np.stack([channels[name] for name in channel_names(image)], axis=-1).astype(dtype)
+
+
 def _read_images(path: Path, names: Iterable[str], width: int, height: int) -> dict[str, np.ndarray]:
     names = list(names)
     expected = [channel for name in names for channel in channel_names(name)]
     planes = _sized(path, exr.read(path, expected), width, height)
-    return {name: stack_planes(planes, name) for name in names}
+    return {name: _stack_planes(planes, name) for name in names}
 
 
 def _make_camera(record: Mapping | None) -> Camera | None:
@@ -69,7 +75,7 @@ def read_frame(root: Path, info: SequenceInfo, record: Mapping, *, native: bool,
       ValueError: names dataset, sequence, frame, file and channel, what was expected and what came.
     """
     native, ranges = native and info.native, ranges and info.ranges
-    number, wide, high = record["number"], info.width * info.scale, info.height * info.scale
+    number, (high, wide) = record["number"], info.output
     try:
         images = _read_images(frame_path(root, info.name, "lr", number), info.channels, info.width, info.height)
         path = frame_path(root, info.name, "hr", number)

@@ -10,8 +10,13 @@ import jax
 import numpy as np
 
 from essjax.cameras import Camera
-from essjax.data.layout import split_planes
+from essjax.data.layout import channel_names
 from essjax.frames import Frame
+
+
+def split_planes(image: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Planes of an image by channel name."""
+    return {name: values[..., i] for i, name in enumerate(channel_names(image))}
 
 
 def plain(content: Any) -> Any:

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.exposure import exposed
-from essjax.frames import Frame, Prediction, depth_scale, rendered_color
+from essjax.frames import Frame, Prediction, depth_scale, frame_size, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation, reset_at_cut
 from essjax.methods.registry import registered
 from essjax.methods.shots import upsampled_reactive
 from essjax.networks import classifier_network, composition_network
+from essjax.sizes import Scale, Size, output_size
 from essjax.typing import Array, Callable, Color, Flag, Image, Mask, Motion, Plane, pytree
 from essjax.warp import (
     Resampled,
@@ -113,18 +114,18 @@ def closeness(frame: Frame, scale: Array) -> Plane:
     return jnp.where(jnp.isfinite(depth), expand_flag(scale, depth.ndim) / depth, 0.0)
 
 
-def look(frame: Frame, unit: Array, scale: int, sigma: float) -> Current:
+def look(frame: Frame, unit: Array, size: Size, sigma: float) -> Current:
     """Bring the frame's buffers to the output's resolution (section 3)."""
     color = reinhard(rendered_color(frame, "classifier"))
-    samples = gaussian_resample(color, rgb_to_ycocg(color), frame.jitter, jnp.float32(sigma), scale)
+    samples = gaussian_resample(color, rgb_to_ycocg(color), frame.jitter, jnp.float32(sigma), size)
     motion = upsample_motion(
-        dilate_motion(frame.motion, frame.gbuffers.depth), scale, jitter=frame.jitter, mode="nearest"
+        dilate_motion(frame.motion, frame.gbuffers.depth), size, jitter=frame.jitter, mode="nearest"
     )
-    reactive = upsampled_reactive(frame, scale)
+    reactive = upsampled_reactive(frame, size)
     return Current(
-        color=jnp.clip(jitter_aligned_upsample(color, scale, frame.jitter, mode="bicubic"), 0.0, 1.0),
+        color=jnp.clip(jitter_aligned_upsample(color, size, frame.jitter, mode="bicubic"), 0.0, 1.0),
         samples=samples,
-        closeness=jitter_aligned_upsample(closeness(frame, unit), scale, frame.jitter, mode="nearest"),
+        closeness=jitter_aligned_upsample(closeness(frame, unit), size, frame.jitter, mode="nearest"),
         motion=jax.lax.stop_gradient(motion),
         trust=1.0 if reactive is None else 1.0 - reactive,
     )
@@ -198,7 +199,7 @@ def _inverse_sigmoid(share: Array) -> Array:
 
 @registered
 def classifier(
-    *, scale: int = 2, width: int = 32, composition_width: int = 64, alpha: float = 0.5, sigma: float = 0.8
+    *, scale: Scale = 2, width: int = 32, composition_width: int = 64, alpha: float = 0.5, sigma: float = 0.8
 ) -> Method:
     """Classifier-guided supersampling of a sequence whose frames are all rendered.
 
@@ -208,7 +209,7 @@ def classifier(
     of the warped history (``warped``), and ``known``: where there is any. Before training it is close to ``taau``.
 
     Args:
-      scale: whole number.
+      scale: see ``sizes.check_scale``.
       width: channels of the classifier's finest scale, a multiple of 8.
       composition_width: of the composition network's hidden layer.
       alpha: smallest share of a sample on its own output pixel, before training.
@@ -217,10 +218,10 @@ def classifier(
     network, composition = classifier_network(width=width, prior=PRIOR), composition_network(width=composition_width)
 
     def start(example: Frame) -> History:
-        *lead, height, low_width, _ = example.motion.shape
+        shape = (*example.motion.shape[:-3], *output_size(scale, frame_size(example)))
 
         def zeros(channels: int) -> Array:  # new each time: a streaming step donates every array of the history
-            return jnp.zeros((*lead, scale * height, scale * low_width, channels), jnp.float32)
+            return jnp.zeros((*shape, channels), jnp.float32)
 
         return History(
             image=zeros(3),
@@ -240,7 +241,7 @@ def classifier(
 
     def init(key, example: Frame):
         key_classifier, key_composition = jax.random.split(key)
-        shape = (*example.motion.shape[:-3], scale * example.motion.shape[-3], scale * example.motion.shape[-2])
+        shape = (*example.motion.shape[:-3], *output_size(scale, frame_size(example)))
         channels = {"classifier": 20, "composition": 17}
         inputs = {name: jax.ShapeDtypeStruct((*shape, count), jnp.float32) for name, count in channels.items()}
         return {
@@ -250,7 +251,7 @@ def classifier(
 
     def render_step(variables, history: History, frame: Frame, *, train=False):
         history = map_colors(reinhard, reset_at_cut(frame.cut, start(frame), history))
-        current = look(frame, history.depth_scale, scale, sigma)
+        current = look(frame, history.depth_scale, output_size(scale, frame_size(frame)), sigma)
         warped = warp_history(history, current)
         inputs = classifier_inputs(current, warped)
         logits, state = network.apply(variables["classifier"], inputs, train=train)

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from essjax.exposure import metered
-from essjax.frames import Frame, Prediction, without_color
+from essjax.frames import Frame, Prediction, frame_size, without_color
 from essjax.interfaces import Method, MethodInfo, Step, no_variables
 from essjax.methods._taau import taa
 from essjax.methods.registry import registered
 from essjax.methods.shots import continued
+from essjax.sizes import describe_scale, output_size
 from essjax.typing import Callable, Color
 
 
@@ -46,16 +47,17 @@ def composed(
       between: ``(frame, the first's image) -> frame`` for the second; replace it where sizes change on the way.
 
     Raises:
-      ValueError: ``first`` lags by more than one frame.
+      ValueError: ``first`` lags by more than one frame, or both supersample.
     """
+    if 1 not in (first.info.scale, second.info.scale):
+        raise ValueError(f"{name}: expected one method of scale 1, got {first.info.scale} and {second.info.scale}.")
     if first.info.latency > 1:
         raise ValueError(f"{name}: expected a first method that lags by at most 1 frame, got {first.info.latency}.")
     late = bool(first.info.latency)
 
     def blank(example: Frame) -> Frame:
-        *lead, height, width, _ = example.motion.shape
-        size = (*lead, round(height * first.info.scale), round(width * first.info.scale), 3)
-        return between(example, jnp.zeros(size, jnp.float32))
+        size = output_size(first.info.scale, frame_size(example))
+        return between(example, jnp.zeros((*example.motion.shape[:-3], *size, 3), jnp.float32))
 
     def init(key, example):
         keys = jax.random.split(key)
@@ -84,7 +86,7 @@ def composed(
 
     info = MethodInfo(
         name,
-        scale=first.info.scale * second.info.scale,
+        scale=second.info.scale if first.info.scale == 1 else first.info.scale,
         latency=first.info.latency + second.info.latency,
         requires=first.info.requires | second.info.requires,
         native=native,
@@ -135,5 +137,6 @@ def with_taa(first: Method, *, alpha: float = 0.5, sigma: float = 0.5) -> Method
       ValueError: ``first`` changes the size.
     """
     if first.info.scale != 1:
-        raise ValueError(f"with_taa: expected a method of scale 1, got {first.info.name} of {first.info.scale:g}.")
+        scale = describe_scale(first.info.scale)
+        raise ValueError(f"with_taa: expected a method of scale 1, got {first.info.name} of {scale}.")
     return composed(f"{first.info.name}+taa", first, settled(taa(alpha=alpha, sigma=sigma)), native=True)

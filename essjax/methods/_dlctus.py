@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from essjax.cameras import pixel_positions
 from essjax.color import reinhard, reinhard_inverse
 from essjax.exposure import exposed
-from essjax.frames import Frame, Prediction, rendered_color
+from essjax.frames import Frame, Prediction, frame_size, rendered_color
 from essjax.interfaces import Method, MethodInfo, refuse_extrapolation
 from essjax.methods.registry import registered
 from essjax.methods.shots import continued, without_history
 from essjax.networks import dlctus_network
+from essjax.sizes import Size, output_size
 from essjax.typing import Array, Callable, Image, Motion, Plane
 from essjax.warp import (
     backward_warp,
@@ -126,30 +127,29 @@ def dlctus(
     name = _name(reprojection, dilate, accumulation)
     network, channels = dlctus_network(), 4 if accumulation else 3
 
-    def output_size(example: Frame) -> tuple[int, ...]:
-        *leading, height, width, _ = example.motion.shape
-        return (*leading, scale * height, scale * width)
+    def size_of(frame: Frame) -> Size:
+        return output_size(scale, frame_size(frame))
 
     def init(key, example: Frame):
-        shape = (*output_size(example), 4 + channels)
+        shape = (*example.motion.shape[:-3], *size_of(example), 4 + channels)
         return {"dlctus": network.init(key, jax.ShapeDtypeStruct(shape, jnp.float32))}
 
     def start(example: Frame):
-        image = jnp.zeros((*output_size(example), channels), jnp.float32)
+        image = jnp.zeros((*example.motion.shape[:-3], *size_of(example), channels), jnp.float32)
         return {"image": image, "empty": jnp.ones(example.cut.shape, bool)}
 
     def reproject(history, frame: Frame, fallback: Image) -> Array:
         motion = dilate_motion(frame.motion, frame.gbuffers.depth) if dilate else frame.motion
-        motion = jax.lax.stop_gradient(upsample_motion(motion, scale, jitter=frame.jitter))
+        motion = jax.lax.stop_gradient(upsample_motion(motion, size_of(frame), jitter=frame.jitter))
         image = map_color(reinhard, history)["image"]
         past = jnp.where(inside_mask(motion) > 0, REPROJECTIONS[reprojection](image, motion), fallback)
-        return without_history(past, fallback, continued(frame, history["empty"]), scale)
+        return without_history(past, fallback, continued(frame, history["empty"]))
 
     def render_step(variables, history, frame: Frame, *, train: bool = False):
         color = reinhard(rendered_color(frame, name))
         depth = linear_depth(frame.gbuffers.depth, near, far)
-        sampled = zero_upsample(jnp.concatenate([color, depth], axis=-1), scale, frame.jitter)
-        aligned = jitter_aligned_upsample(color, scale, frame.jitter)
+        sampled = zero_upsample(jnp.concatenate([color, depth], axis=-1), size_of(frame), frame.jitter)
+        aligned = jitter_aligned_upsample(color, size_of(frame), frame.jitter)
         if accumulation:
             aligned = jnp.concatenate([aligned, jnp.ones_like(aligned[..., :1])], axis=-1)
         past = reproject(history, frame, aligned)

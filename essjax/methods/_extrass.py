@@ -1,4 +1,4 @@
-"""ExtraSS (Wu et al. 2023): ``extrass`` supersamples both kinds of frames, 2x.
+"""ExtraSS (Wu et al. 2023): ``extrass`` supersamples both kinds of frames, by any ratio.
 
 Pipeline: extrapolation at low resolution (``extrass_low``, sections 4.2 and 4.3), ExtraSSNet (4.4).
 """
@@ -16,6 +16,7 @@ from essjax.frames import (
     GBuffers,
     Prediction,
     depth_scale,
+    frame_size,
     network_depth,
     without_color,
 )
@@ -34,7 +35,8 @@ from essjax.methods.rendered import (
 )
 from essjax.methods.shots import fade, upsampled_reactive, within_shots
 from essjax.networks import extrassnet, frnet
-from essjax.networks.blocks import nearest_upsample
+from essjax.networks.blocks import crop, nearest_upsample, pad_to_multiple
+from essjax.sizes import Scale, Size, check_scale, output_size, ratios
 from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, pytree
 from essjax.warp import (
     Resampled,
@@ -42,9 +44,11 @@ from essjax.warp import (
     depth_to_space,
     dilate_motion,
     gaussian_resample,
+    half_grid_offset,
     hole_mask,
     inside_mask,
     space_to_depth,
+    to_half_grid,
     upsample_motion,
 )
 from essjax.warp.gbuffer_guided import SIGMA_DISTANCE, SIGMA_GUIDE
@@ -97,7 +101,7 @@ class Seen:
       motion: to the last output, ``[..., sH, sW, 2]`` HR pixels.
       valid: see ``Warped``.
       valid_low: see ``Warped``.
-      low: inputs of E0 or E1 that are LR, ``[..., H, W, C]``.
+      low: inputs of E0 or E1 that are LR, on the half grid (``warp.half_grid``), ``[..., h, w, C]``.
       current: the LR colour (log1p) resampled to the HR grid.
       prior: logit of its share before training, ``[..., sH, sW, 1]``.
       conditions: see ``conditions_of``.
@@ -131,10 +135,10 @@ class Warped:
     valid_low: Mask
 
 
-def history_motion(frame: Frame, scale: int) -> Motion:
-    """Where each HR pixel was in the last output, ``[..., sH, sW, 2]`` HR pixels."""
+def history_motion(frame: Frame, size: Size) -> Motion:
+    """Where each HR pixel was in the last output, ``[..., *size, 2]`` HR pixels."""
     # Dilated, so that the history of a silhouette moves with the surface in front.
-    return upsample_motion(dilate_motion(frame.motion, frame.gbuffers.depth), scale, jitter=frame.jitter)
+    return upsample_motion(dilate_motion(frame.motion, frame.gbuffers.depth), size, jitter=frame.jitter)
 
 
 def trusted(frame: Frame, gbuffers: GBuffers, jitter: Jitter) -> Mask:
@@ -151,21 +155,22 @@ def warp_shown(image: Color, motion: Motion) -> Color:
     return log1p_of_reinhard(backward_warp(reinhard(image), motion, mode="bicubic"))
 
 
-def conditions_of(frame: Frame, age: Array | None, scale: int) -> Array:
+def conditions_of(frame: Frame, age: Array | None, size: Size) -> Array:
     """Say how a frame differs from the paper's setting, ``[..., CONDITIONS]``; 0 where it does not.
 
     No base colour, no normals, how many frames more than one the last rendered one is away (over 2), the logarithm of
-    output size over twice the input size.
+    output size over twice the input size (the mean of both sides' ones).
 
     Args:
       frame: its buffers.
       age: of the last rendered frame, ``[...]``; None for a rendered frame.
-      scale: output size over input size.
+      size: (height, width) of the output.
     """
     like = jnp.zeros(frame.cut.shape, jnp.float32)
     absent = [like + float(image is None) for image in (frame.gbuffers.base_color, frame.gbuffers.normal)]
     farther = like if age is None else (jnp.clip(age, 1.0, 8.0) - 1.0) / 2.0
-    return jnp.stack([*absent, farther, like + math.log2(scale / 2)], axis=-1)
+    larger = 0.5 * math.log2(math.prod(ratios(frame_size(frame), size))) - 1.0
+    return jnp.stack([*absent, farther, like + larger], axis=-1)
 
 
 def _mean_of_nine(mask: Mask) -> Mask:
@@ -196,13 +201,14 @@ CLAMP_LOGIT = 0.5
 """Logit of how far history is moved into the box of the current samples, before training."""
 
 
-def _compose(head: Array, warped: Color, seen: Seen, scale: int) -> Image:
+def _compose(head: Array, warped: Color, seen: Seen) -> Image:
     """Blend warped history and the current colour (both log1p, HR) by the corrected prior and add the residual.
 
     TAA clamps history to the YCoCg box of the current samples: ghosts go, and so does detail finer than the samples.
     How far to go there is the network's choice.
     """
-    output, current = depth_to_space(head, scale), seen.current
+    current = seen.current
+    output = crop(depth_to_space(head, 2), *current.color.shape[-3:-1])
     share = jax.nn.sigmoid(seen.prior + output[..., :1])
     clamping = jax.nn.sigmoid(CLAMP_LOGIT + output[..., 1:2])
     # One channel each: fused with the blend they would be computed for each of its three.
@@ -217,7 +223,7 @@ def extrass(
     *,
     width: int = 24,
     frnet_width: int = 16,
-    scale: int = 2,
+    scale: Scale = 2,
     sigma_guide: float | tuple[float, ...] = SIGMA_GUIDE,
     sigma_distance: float = SIGMA_DISTANCE,
 ) -> Method:
@@ -229,11 +235,12 @@ def extrass(
     Args:
       width: of ExtraSSNet.
       frnet_width: of FRNet.
-      scale: output size over input size.
+      scale: output size over input size, any number >= 1, or the output's (width, height); one set of variables serves
+        all.
       sigma_guide: see ``extrass_w``.
       sigma_distance: see ``extrass_w``.
     """
-    flow_network, network = frnet(frnet_width), extrassnet(width, scale)
+    flow_network, network, scale = frnet(frnet_width), extrassnet(width), check_scale(scale)
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
     def start(example: Frame) -> Parted:
@@ -243,7 +250,7 @@ def extrass(
             jitter=jnp.copy(example.jitter),
             depth_scale=depth_scale(example.gbuffers),
         )
-        image = nearest_upsample(jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32), scale)
+        image = jnp.zeros((*example.motion.shape[:-3], *output_size(scale, frame_size(example)), 3), jnp.float32)
         return Parted(memory=past, shown=image)
 
     def init(key, example):
@@ -281,6 +288,7 @@ def extrass(
 
     def observe(variables, notes: Notes, frame: Frame) -> Seen:
         color, extrapolated, extra = frame.color, None, []
+        size = output_size(scale, frame_size(frame))
         if notes.rendered is not None:
             pair = jax.tree.map(lambda *frames: jnp.stack(frames), *notes.rendered)
             extrapolated = extrapolate(flow_network, variables["frnet"], pair, notes.count, frame, sigmas)
@@ -289,28 +297,29 @@ def extrass(
             extra = [log1p(extrapolated.warp), jnp.zeros_like(color) if base is None else base]
         assert color is not None
         encoded = log1p(color)
-        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), scale)
-        motion, valid_low = history_motion(frame, scale), trusted(frame, notes.gbuffers, notes.jitter)
+        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), size)
+        motion, valid_low = history_motion(frame, size), trusted(frame, notes.gbuffers, notes.jitter)
         valid_low = jax.lax.stop_gradient(valid_low)
-        valid = nearest_upsample(valid_low, scale) * inside_mask(motion)
+        low = [encoded, network_depth(frame.gbuffers, notes.depth_scale), valid_low, *extra]
+        low = [to_half_grid(image, size, frame.jitter) for image in low]
+        valid = crop(nearest_upsample(low[2]), *size) * inside_mask(motion)
         weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98) if extrapolated is None else EXTRAPOLATED_SHARE
-        jitter = jnp.broadcast_to(frame.jitter[..., None, None, :], (*encoded.shape[:-1], 2))
-        low = [encoded, network_depth(frame.gbuffers, notes.depth_scale), valid_low, jitter, *extra]
+        low.insert(3, half_grid_offset(frame_size(frame), size, frame.jitter))
         return Seen(
             cut=frame.cut,
-            reactive=upsampled_reactive(frame, scale),
+            reactive=upsampled_reactive(frame, size),
             motion=motion,
             valid=valid,
             valid_low=valid_low,
             low=jnp.concatenate(low, axis=-1),
             current=current,
             prior=_prior(valid, weight),
-            conditions=conditions_of(frame, None if notes.rendered is None else notes.rendered[0].age, scale),
+            conditions=conditions_of(frame, None if notes.rendered is None else notes.rendered[0].age, size),
             extrapolated=extrapolated,
         )
 
     def _inputs(seen: Seen, warped: Color) -> Image:
-        high = [space_to_depth(seen.current.color, scale), space_to_depth(warped, scale)]
+        high = [space_to_depth(pad_to_multiple(image, 2), 2) for image in (seen.current.color, warped)]
         return jnp.concatenate([*high, seen.low], axis=-1)
 
     def show(variables, image: Color, seen: Seen, *, train: bool):
@@ -320,7 +329,7 @@ def extrass(
         inputs = _inputs(seen, log_warped)
         given = inputs, seen.conditions
         (head, features), _ = network.apply(variables["extrassnet"], *given, train=train, method=encode)
-        log_image = _compose(head, log_warped, seen, scale)
+        log_image = _compose(head, log_warped, seen)
         warped = Warped(log_image=log_warped, valid=seen.valid, valid_low=seen.valid_low)
         aux = {"log_image": log_image, "warped": warped, "features": features}
         if seen.extrapolated is not None:

@@ -18,6 +18,7 @@ from essjax.frames import (
     GBuffers,
     Prediction,
     depth_scale,
+    frame_size,
     network_depth,
     rendered_color,
     require,
@@ -39,6 +40,7 @@ from essjax.methods.rendered import (
 )
 from essjax.methods.shots import within_shots
 from essjax.networks._fasset import LOCAL, PAST
+from essjax.sizes import Scale, Size, check_scale, output_size, ratios
 from essjax.typing import Array, Callable, Color, Image, Jitter, Mask, Scalar, pytree
 from essjax.warp import (
     backward_warp,
@@ -64,7 +66,7 @@ class Kept:
     Attributes:
       shading: demodulated colour, linear, ``[..., H, W, 3]``.
       hidden: the recurrent state after it, at pixel centres, ``[..., H, W, width]``.
-      image: the output, linear, ``[..., round(scale H), round(scale W), 3]``.
+      image: the output, linear, ``[..., H', W', 3]``.
       surfaces: the G-buffers that tell surfaces apart.
     """
 
@@ -99,7 +101,7 @@ class Arrival(NamedTuple):
       recent: 1 where the last frame, rendered or not, did; 1 everywhere if there was none, and where the
         frame is reactive.
       sampled: its output at the samples, log1p, 0 where there is none, ``[..., H, W, 3]``.
-      image: its output at this frame's, log1p, ``[..., round(scale H), round(scale W), 3]``.
+      image: its output at this frame's, log1p, ``[..., H', W', 3]``.
       known: 1 where there is one: not off screen, not reactive.
     """
 
@@ -116,14 +118,13 @@ def _surfaces(gbuffers: GBuffers) -> GBuffers:
     return jax.tree.map(jnp.copy, hole_buffers(gbuffers))  # streaming donates the history, not the frame
 
 
-def _start(example: Frame, scale: float, width: int) -> History:
-    *lead, height, low_width, _ = example.motion.shape
-
-    def zeros(scale: float, channels: int) -> Array:
-        return jnp.zeros((*lead, round(scale * height), round(scale * low_width), channels), jnp.float32)
+def _start(example: Frame, size: Size, width: int) -> History:
+    def zeros(size: Size, channels: int) -> Array:
+        return jnp.zeros((*example.motion.shape[:-3], *size, channels), jnp.float32)
 
     surfaces = _surfaces(example.gbuffers)
-    kept = Kept(shading=zeros(1, 3), hidden=zeros(1, width), image=zeros(scale, 3), surfaces=surfaces)
+    low = frame_size(example)
+    kept = Kept(shading=zeros(low, 3), hidden=zeros(low, width), image=zeros(size, 3), surfaces=surfaces)
     return History(
         rendered=start_memory(example, kept, 1),
         surfaces=_surfaces(example.gbuffers),
@@ -131,9 +132,9 @@ def _start(example: Frame, scale: float, width: int) -> History:
     )
 
 
-def _arrive(history: History, frame: Frame, scale: float, width: int) -> tuple[History, Arrival]:
+def _arrive(history: History, frame: Frame, size: Size, width: int) -> tuple[History, Arrival]:
     """Extend the history's path to ``frame``; returns it and what it shows there."""
-    fresh, before = _start(frame, scale, width), history.rendered
+    fresh, before = _start(frame, size, width), history.rendered
     before = reset_memory(frame.cut, fresh.rendered, before)
     surfaces = reset_at_cut(frame.cut, fresh.surfaces, history.surfaces)
     unit = reset_at_cut(frame.cut, fresh.depth_scale, history.depth_scale)
@@ -151,28 +152,31 @@ def _arrive(history: History, frame: Frame, scale: float, width: int) -> tuple[H
         # What a reactive pixel shows is its own sample: nothing is cut out of it.
         recent = jnp.maximum(recent, frame.reactive)
     history = History(rendered=memory, surfaces=_surfaces(frame.gbuffers), depth_scale=unit)
-    return history, Arrival(valid=valid, recent=recent, **_read(last, frame, scale, valid, trust))
+    return history, Arrival(valid=valid, recent=recent, **_read(last, frame, size, valid, trust))
 
 
-def _read(last: Rendered, frame: Frame, scale: float, valid: Mask, trust: Mask) -> dict[str, Array]:
+def _read(last: Rendered, frame: Frame, size: Size, valid: Mask, trust: Mask) -> dict[str, Array]:
     """Read what was kept on its own grid: shading at samples, hidden state at pixel centres, image at output size.
 
     Held on unjittered grids, what is written in one frame is read in another as it was; from samples to samples it
     would be blurred by each new jitter.
     """
-    height, low_width = frame.motion.shape[-3:-1]
+    height, low_width = frame_size(frame)
     kept, motion = last.content, jax.lax.stop_gradient(last.motion)
     shading, image = log1p(jax.lax.stop_gradient(kept.shading)), log1p(kept.image)
     shading = backward_warp(shading, jittered_motion(motion, frame.jitter, last.jitter))
-    hidden = backward_warp(kept.hidden, upsample_motion(motion, 1, jitter=frame.jitter))
+    hidden = backward_warp(kept.hidden, upsample_motion(motion, (height, low_width), jitter=frame.jitter))
     samples = pixel_positions(height, low_width, frame.jitter) + motion
     # Dilated, so that the history of a silhouette moves with the surface in front.
-    at_output = upsample_motion(dilate_motion(motion, frame.gbuffers.depth), scale, jitter=frame.jitter)
-    known = inside_mask(at_output) * jitter_aligned_upsample(trust, scale, frame.jitter, mode="nearest")
+    at_output = upsample_motion(dilate_motion(motion, frame.gbuffers.depth), size, jitter=frame.jitter)
+    known = inside_mask(at_output) * jitter_aligned_upsample(trust, size, frame.jitter, mode="nearest")
     return {
         "shading": shading,
         "hidden": _as_far_as(valid, hidden),
-        "sampled": _as_far_as(inside_mask(motion) * trust, sample(image, scale * samples)),
+        "sampled": _as_far_as(
+            inside_mask(motion) * trust,
+            sample(image, jnp.asarray(ratios((height, low_width), size), jnp.float32) * samples),
+        ),
         # Bicubic: bilinear would blur the history a little more with every frame.
         "image": backward_warp(image, at_output, mode="bicubic"),
         "known": known,
@@ -184,14 +188,14 @@ def _as_far_as(mask: Mask, image: Image) -> Image:
     return jnp.where(mask > 0, mask * image, 0.0)
 
 
-def _into_box(image: Color, samples: Color, jitter: Jitter, scale: float) -> Color:
+def _into_box(image: Color, samples: Color, jitter: Jitter) -> Color:
     """``image`` clamped to the YCoCg box of the 3x3 samples around each output pixel, as TAA does.
 
     Reflections and shadows move without motion vectors; a network that saw few of them trusts their history.
     """
     box = rgb_to_ycocg(samples)
     low, high = (
-        jitter_aligned_upsample(_around(box, choose), scale, jitter, mode="nearest")
+        jitter_aligned_upsample(_around(box, choose), image.shape[-3:-1], jitter, mode="nearest")
         for choose in (jnp.minimum, jnp.maximum)
     )
     return ycocg_to_rgb(jnp.clip(rgb_to_ycocg(image), low, high))
@@ -206,33 +210,33 @@ def _around(image: Image, choose: Callable[[Array, Array], Array]) -> Image:
     return image
 
 
-def sample_nearness(height: int, width: int, scale: float, jitter: Jitter) -> Mask:
+def sample_nearness(low: Size, size: Size, jitter: Jitter) -> Mask:
     """How near each output pixel is to the nearest sample, a Gaussian of ``SAMPLE_SIGMA`` output pixels: (0, 1].
 
     Args:
-      height: of the input.
-      width: of the input.
-      scale: output size over input size.
+      low: (height, width) of the input.
+      size: of the output.
       jitter: ``[..., 2]`` LR pixels.
 
     Returns:
-      ``[..., round(scale H), round(scale W), 1]``.
+      ``[..., *size, 1]``.
     """
 
-    def along(size: int, jitter: Array) -> Array:
-        """Squared distance in output pixels, ``[..., round(scale * size)]``."""
-        position = (jnp.arange(round(scale * size), dtype=jnp.float32) + 0.5) / scale - jitter[..., None]
-        nearest = jnp.clip(jnp.floor(position), 0, size - 1) + 0.5
-        return (scale * (position - nearest)) ** 2
+    def along(axis: int, jitter: Array) -> Array:
+        """Squared distance in output pixels, ``[..., size[axis]]``."""
+        ratio = size[axis] / low[axis]
+        position = (jnp.arange(size[axis], dtype=jnp.float32) + 0.5) / ratio - jitter[..., None]
+        nearest = jnp.clip(jnp.floor(position), 0, low[axis] - 1) + 0.5
+        return (ratio * (position - nearest)) ** 2
 
-    distance = along(height, jitter[..., 1])[..., :, None] + along(width, jitter[..., 0])[..., None, :]
+    distance = along(0, jitter[..., 1])[..., :, None] + along(1, jitter[..., 0])[..., None, :]
     return jnp.exp(-0.5 * distance / SAMPLE_SIGMA**2)[..., None]
 
 
 @registered
 def fasset(
     *,
-    scale: float = 2,
+    scale: Scale = 2,
     width: int = 24,
     hidden: int | None = None,
     gencoder: bool = True,
@@ -245,10 +249,10 @@ def fasset(
     look alike and in-painting is learned from both. The output is RenderINR's colour plus a base, moved towards the
     last rendered frame's output by a share that RenderINR says (0 before training). The base is the input upsampled:
     warped and filled smoothly without its texture, given that of the current frame; output pixel P reads at
-    (P + 0.5) / scale - jitter. The hidden state is updated by rendered frames, follows the motion and is 0 in holes.
+    (P + 0.5) / ratio - jitter. The hidden state is updated by rendered frames, follows the motion and is 0 in holes.
 
     Args:
-      scale: output size over input size, any positive number; output sizes are rounded.
+      scale: output size over input size, any number >= 1, or the output's (width, height).
       width: of the encoders; each of the two feature maps has 3 channels fewer.
       hidden: neurons of RenderINR's layers; None: 16/3 of the width, 128 at 24.
       gencoder: False feeds RenderINR the G-buffers themselves (Table 4, "- GEncoder").
@@ -256,22 +260,24 @@ def fasset(
       shared: False gives each task a FrameEncoder of its own (Table 4, "- Shared weights").
 
     Raises:
-      ValueError: the scale is not positive, or the width is below 4.
+      ValueError: no such scale, or the width is below 4.
     """
-    if not scale > 0:
-        raise ValueError(f"scale: expected a positive number, got {scale!r}.")
+    scale = check_scale(scale)
     hidden = width * 16 // 3 if hidden is None else hidden
-    network = networks.fasset(scale=scale, width=width, hidden=hidden, gencoder=gencoder, shared=shared)
+    network = networks.fasset(width=width, hidden=hidden, gencoder=gencoder, shared=shared)
     removed = {"no-gencoder": not gencoder, "no-mask": not mask_rendered, "no-sharing": not shared}
     name = "-".join(["fasset", *(part for part, absent in removed.items() if absent)])
 
+    def size_of(frame: Frame) -> Size:
+        return output_size(scale, frame_size(frame))
+
     def start(example):
-        return _start(example, scale, width)
+        return _start(example, size_of(example), width)
 
     def init(key, example):
         require(example, sorted(REQUIRES), name)
         *lead, height, low_width, _ = example.motion.shape
-        large = (*lead, round(scale * height), round(scale * low_width), LOCAL)
+        large = (*lead, *size_of(example), LOCAL)
         low = [(*lead, height, low_width, channels) for channels in (3, 1, 7, PAST, width)]
         shapes = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in (*low, large, example.jitter.shape)]
         return {"fasset": network.init(key, *shapes)}
@@ -280,10 +286,10 @@ def fasset(
         """Predict the output as log1p, the new hidden state, statistics; ``shading`` (log1p) is not read in holes."""
         texture = albedo(frame.gbuffers)
         filled = log1p(modulate(expm1(fill_holes(shading, mask)), texture))
-        base = jax.lax.stop_gradient(jitter_aligned_upsample(filled, scale, frame.jitter))
-        past = _into_box(arrival.image, jax.lax.stop_gradient(filled), frame.jitter, scale)
+        base = jax.lax.stop_gradient(jitter_aligned_upsample(filled, size_of(frame), frame.jitter))
+        past = _into_box(arrival.image, jax.lax.stop_gradient(filled), frame.jitter)
         difference = _as_far_as(arrival.known, past - base)
-        trusted = jitter_aligned_upsample(arrival.valid, scale, frame.jitter, mode="nearest")
+        trusted = jitter_aligned_upsample(arrival.valid, size_of(frame), frame.jitter, mode="nearest")
         inputs = (
             mask * filled,
             mask,
@@ -299,9 +305,9 @@ def fasset(
     def render_step(variables, history, frame, *, train=False):
         linear = demodulate(rendered_color(frame, name), albedo(frame.gbuffers))
         shading = log1p(linear)
-        history, arrival = _arrive(history, frame, scale, width)
+        history, arrival = _arrive(history, frame, size_of(frame), width)
         mask = arrival.recent if mask_rendered else jnp.ones_like(arrival.recent)
-        near = sample_nearness(*shading.shape[-3:-1], scale, frame.jitter)
+        near = sample_nearness(frame_size(frame), size_of(frame), frame.jitter)
         log_image, hidden, state = predict(variables, history, frame, shading, mask, arrival, near, train, "render")
         image = expm1(log_image)
         kept = Kept(shading=linear, hidden=hidden, image=image, surfaces=_surfaces(frame.gbuffers))
@@ -310,7 +316,7 @@ def fasset(
         return history, Prediction(image=image, aux=aux, state=state)
 
     def extrapolate_step(variables, history, frame, *, train=False):
-        history, arrival = _arrive(history, frame, scale, width)
+        history, arrival = _arrive(history, frame, size_of(frame), width)
         mask, nowhere = arrival.valid, jnp.zeros_like(arrival.known)
         given = arrival.shading, mask, arrival, nowhere
         log_image, _, state = predict(variables, history, frame, *given, train, "extrapolate")

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse, rgb_to_ycocg, ycocg_to_rgb
 from essjax.exposure import exposed
-from essjax.frames import Frame, Prediction, rendered_color
+from essjax.frames import Frame, Prediction, frame_size, rendered_color
 from essjax.interfaces import Method, MethodInfo, expand_flag, refuse_extrapolation
 from essjax.methods.registry import registered
 from essjax.methods.shots import path_trust, upsampled_reactive, within_shots
+from essjax.sizes import Scale, Size, check_scale, output_size
 from essjax.typing import Array, PyTree
 from essjax.warp import (
     Resampled,
@@ -39,7 +40,7 @@ that the first sample replaces."""
 class Settings(NamedTuple):
     """Settings that are fixed at trace time; see ``taau``."""
 
-    scale: int
+    scale: Scale
     clamp: str
     dilate: bool
     history_mode: str
@@ -74,14 +75,18 @@ def _rectify(history: Array, current: Resampled, settings: Settings) -> Array:
     return decode(jnp.clip(encode(history), current.low, current.high))
 
 
+def _size(frame: Frame, settings: Settings) -> Size:
+    return output_size(settings.scale, frame_size(frame))
+
+
 def _output_motion(frame: Frame, settings: Settings) -> Array:
     motion = dilate_motion(frame.motion, frame.gbuffers.depth) if settings.dilate else frame.motion
-    return upsample_motion(motion, settings.scale, jitter=frame.jitter)
+    return upsample_motion(motion, _size(frame, settings), jitter=frame.jitter)
 
 
 def _path(history: PyTree, frame: Frame, settings: Settings) -> tuple[Array, Array | None]:
     """From this frame to the image in the history, at output resolution: motion, and what masks leave of it."""
-    motion, reactive = _output_motion(frame, settings), upsampled_reactive(frame, settings.scale)
+    motion, reactive = _output_motion(frame, settings), upsampled_reactive(frame, _size(frame, settings))
     if "motion" not in history:  # every frame is rendered: the image is the previous frame's
         return motion, None if reactive is None else 1.0 - reactive
     trust = path_trust(history["trust"], reactive, motion)
@@ -115,15 +120,15 @@ def _render_step(settings: Settings, variables: PyTree, history: PyTree, frame: 
     color = reinhard(rendered_color(frame, "taau"))
     bounded = rgb_to_ycocg(color) if settings.clamp == "ycocg" else color
     if settings.kernel == "tent":
-        current = tent_resample(color, bounded, frame.jitter, settings.scale)
+        current = tent_resample(color, bounded, frame.jitter, _size(frame, settings))
     else:
-        current = gaussian_resample(color, bounded, frame.jitter, variables["sigma"], settings.scale)
+        current = gaussian_resample(color, bounded, frame.jitter, variables["sigma"], _size(frame, settings))
     past, count = _reproject(history, *_path(history, frame, settings), frame, settings)
     rate, total = _blend(count, current.weight, variables["alpha"], settings)
     rate = jnp.where(count > 0, rate, 1.0)
     past = _rectify(past, current, settings)
     image = past + rate * (current.color - past)
-    upsampled = jitter_aligned_upsample(color, settings.scale, frame.jitter)
+    upsampled = jitter_aligned_upsample(color, _size(frame, settings), frame.jitter)
     image = jnp.where(count > 0, image, upsampled)
     image = reinhard_inverse(image)
     new = {"color": image, "count": total}
@@ -144,8 +149,7 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
     for option, allowed in choices.items():
         if getattr(settings, option) not in allowed:
             raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {getattr(settings, option)!r}.")
-    if settings.scale < 1 or int(settings.scale) != settings.scale:
-        raise ValueError(f"scale: expected a whole number >= 1, got {settings.scale!r}.")
+    settings = settings._replace(scale=check_scale(settings.scale))
     if not (0 < alpha <= 1 and sigma > 0):
         raise ValueError(f"expected 0 < alpha <= 1 and sigma > 0, got alpha = {alpha} and sigma = {sigma}.")
 
@@ -153,8 +157,7 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
         return {"alpha": jnp.asarray(alpha, jnp.float32), "sigma": jnp.asarray(sigma, jnp.float32)}
 
     def start(example: Frame) -> PyTree:
-        *leading, height, width, _ = example.motion.shape
-        size = (*leading, settings.scale * height, settings.scale * width)
+        size = (*example.motion.shape[:-3], *_size(example, settings))
         history = {"color": jnp.zeros((*size, 3), jnp.float32), "count": jnp.zeros((*size, 1), jnp.float32)}
         if half:
             history["motion"] = jnp.zeros((*size, 2), jnp.float32)
@@ -185,7 +188,7 @@ def _accumulator(name: str, settings: Settings, alpha: float, sigma: float, *, h
 @registered
 def taau(
     *,
-    scale: int = 2,
+    scale: Scale = 2,
     alpha: float = 0.7,
     sigma: float = 0.8,
     clamp: str = "ycocg",
@@ -208,7 +211,7 @@ def taau(
     ``variables`` are ``{"alpha", "sigma"}``, float32 scalars: a grid over them needs no new compilation.
 
     Args:
-      scale: whole number.
+      scale: output size over input size, any number >= 1, or the output's (width, height).
       alpha: share of the current sample, (0, 1]. "bounded": N is at most 1 / alpha, our reading; "constant": there are
         at most (2 - alpha) / alpha effective samples (eq 37).
       sigma: standard deviation of the Gaussian, output pixels.
@@ -231,7 +234,7 @@ def taau(
 @registered
 def taau_half(
     *,
-    scale: int = 2,
+    scale: Scale = 2,
     alpha: float = 0.7,
     sigma: float = 0.8,
     clamp: str = "ycocg",
@@ -268,7 +271,7 @@ def taa(
 
 
 @registered
-def tus(*, scale: int = 2, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
+def tus(*, scale: Scale = 2, alpha: float | None = None, sigma: float = 0.65, clamp: str = "rgb") -> Method:
     """Make the TUS row of thesis 002 (section 5.3.1): history clamping, bicubic (a = -0.75), no dilation.
 
     Constant α, and history that is started and padded with the jitter-aligned upsampled frame, as in ``dlctus``. Our
@@ -276,7 +279,7 @@ def tus(*, scale: int = 2, alpha: float | None = None, sigma: float = 0.65, clam
     thesis jitter) it gets 26.0 dB, with the tent 24.6.
 
     Args:
-      scale: whole number.
+      scale: see ``taau``.
       alpha: share of the current sample; None: 0.5, and 1 for scale 4, as in the thesis.
       sigma: standard deviation of the Gaussian, output pixels.
       clamp: see ``taau``.

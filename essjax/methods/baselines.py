@@ -7,33 +7,35 @@ import jax.numpy as jnp
 
 from essjax.color import reinhard, reinhard_inverse
 from essjax.exposure import exposed
-from essjax.frames import Frame, Prediction, rendered_color
+from essjax.frames import Frame, Prediction, frame_size, rendered_color
 from essjax.interfaces import Method, MethodInfo, no_variables
 from essjax.methods.registry import registered
 from essjax.methods.shots import within_shots
+from essjax.sizes import Scale, Size, check_scale, output_size
 from essjax.typing import Array, Callable, Image, PyTree
 from essjax.warp import backward_warp, compose_motion, jitter_aligned_upsample, jittered_motion
 
 
-def jau_image(frame: Frame, scale: float, *, mode: str = "bilinear") -> Array:
-    """Upsample the frame's colour from where its samples lie (JAU, SPEC 4), ``[..., scale H, scale W, 3]``.
+def jau_image(frame: Frame, size: Size, *, mode: str = "bilinear") -> Array:
+    """Upsample the frame's colour from where its samples lie (JAU, SPEC 4), ``[..., *size, 3]``.
 
     Inside x / (1 + x): a highlight then does not bleed over its neighbours and bicubic kernels hardly ring. It is the
     stronger baseline (bilinear on the chess clip: 29.7 dB, on radiance 29.1, after x / (1 + x)).
     """
     color = reinhard(rendered_color(frame, "upscaling"))
-    return reinhard_inverse(jitter_aligned_upsample(color, scale, frame.jitter, mode=mode))
+    return reinhard_inverse(jitter_aligned_upsample(color, size, frame.jitter, mode=mode))
 
 
-def _spatial(name: str, scale: float, upscale: Callable[[Frame], Array]) -> Method:
+def _spatial(name: str, scale: Scale, upscale: Callable[[Frame, Size], Array]) -> Method:
     """Make a method that upscales each rendered frame by itself and repeats it on frames without colour."""
+    scale = check_scale(scale)
 
     def start(example: Frame) -> PyTree:
-        *leading, height, width, _ = example.motion.shape
-        return {"image": jnp.zeros((*leading, round(height * scale), round(width * scale), 3), jnp.float32)}
+        size = output_size(scale, frame_size(example))
+        return {"image": jnp.zeros((*example.motion.shape[:-3], *size, 3), jnp.float32)}
 
     def render_step(variables, history, frame, *, train=False):
-        image = upscale(frame)
+        image = upscale(frame, output_size(scale, frame_size(frame)))
         return {"image": image}, Prediction(image=image)
 
     def extrapolate_step(variables, history, frame, *, train=False):
@@ -51,37 +53,37 @@ def _without_jitter(frame: Frame) -> Frame:
 
 
 @registered
-def bilinear(*, scale: float = 2) -> Method:
+def bilinear(*, scale: Scale = 2) -> Method:
     """Bilinear upscaling of each rendered frame in x / (1 + x); like a plain upscaler it ignores the jitter.
 
     Frames without colour repeat the last image and are not scored.
 
     Args:
-      scale: output size over input size.
+      scale: output size over input size, any number >= 1, or the output's (width, height).
     """
-    return _spatial("bilinear", scale, lambda frame: jau_image(_without_jitter(frame), scale))
+    return _spatial("bilinear", scale, lambda frame, size: jau_image(_without_jitter(frame), size))
 
 
 @registered
-def bicubic(*, scale: float = 2) -> Method:
+def bicubic(*, scale: Scale = 2) -> Method:
     """Bicubic (a = -0.5) upscaling of each rendered frame on x / (1 + x); ignores the jitter. See ``bilinear``.
 
     Args:
-      scale: output size over input size.
+      scale: output size over input size, any number >= 1, or the output's (width, height).
     """
-    return _spatial("bicubic", scale, lambda frame: jau_image(_without_jitter(frame), scale, mode="bicubic"))
+    return _spatial("bicubic", scale, lambda frame, size: jau_image(_without_jitter(frame), size, mode="bicubic"))
 
 
 @registered
-def jau(*, scale: float = 2, mode: str = "bilinear") -> Method:
+def jau(*, scale: Scale = 2, mode: str = "bilinear") -> Method:
     """Jitter-aligned upsampling of each rendered frame: it reads where the samples really lie. See ``bilinear``.
 
     Args:
-      scale: output size over input size.
+      scale: output size over input size, any number >= 1, or the output's (width, height).
       mode: "nearest", "bilinear", "bicubic" or "bicubic-0.75"; not bilinear is named ``jau-<mode>``.
     """
     name = "jau" if mode == "bilinear" else f"jau-{mode}"
-    return _spatial(name, scale, lambda frame: jau_image(frame, scale, mode=mode))
+    return _spatial(name, scale, lambda frame, size: jau_image(frame, size, mode=mode))
 
 
 def gaussian_blur(image: Image, std: float) -> Array:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from essjax.color import demodulate, expm1, modulate
 from essjax.exposure import exposed
-from essjax.frames import Frame, GBuffers, Prediction, rendered_color, require
+from essjax.frames import Frame, GBuffers, Prediction, frame_size, rendered_color, require
 from essjax.interfaces import Method, MethodInfo
 from essjax.methods._composed import composed
 from essjax.methods._extranet import REQUIRES, Inputs, Kept, extranet, network_inputs
@@ -17,24 +17,25 @@ from essjax.methods.rendered import Memory, advance, albedo, hole_buffers, map_s
 from essjax.methods.shots import within_shots
 from essjax.networks._extranet import FRAMES, input_shapes
 from essjax.networks._extranet import extranet as extranet_network
+from essjax.sizes import Scale, Size, check_scale, output_size
 from essjax.typing import Color, Image
 from essjax.warp import jitter_aligned_upsample, upsample_motion, zero_upsample
 
 
-def enlarge(frame: Frame, scale: int, color: Color | None) -> Frame:
-    """``frame`` at output size with ``color`` ``[..., sH, sW, 3]`` (or None), unjittered, its buffers upsampled.
+def enlarge(frame: Frame, size: Size, color: Color | None) -> Frame:
+    """``frame`` at output size with ``color`` ``[..., *size, 3]`` (or None), unjittered, its buffers upsampled.
 
     Buffers are read where their samples lie: materials bilinearly, what tells surfaces apart from the nearest sample.
     World position is left out: between two samples it would be wrong by more than what hole marking allows.
 
     Args:
       frame: at low resolution.
-      scale: whole number.
+      size: (height, width) of the output.
       color: its colour at output size.
     """
 
     def up(image: Image | None, mode: str) -> Image | None:
-        return None if image is None else jitter_aligned_upsample(image, scale, frame.jitter, mode=mode)
+        return None if image is None else jitter_aligned_upsample(image, size, frame.jitter, mode=mode)
 
     buffers = frame.gbuffers
     materials = {name: up(getattr(buffers, name), "bilinear") for name in ("base_color", "roughness", "metallic")}
@@ -43,12 +44,12 @@ def enlarge(frame: Frame, scale: int, color: Color | None) -> Frame:
         frame,
         color=color,
         gbuffers=GBuffers(
-            depth=jitter_aligned_upsample(buffers.depth, scale, frame.jitter, mode="nearest"),
+            depth=jitter_aligned_upsample(buffers.depth, size, frame.jitter, mode="nearest"),
             specular=up(buffers.specular, "bilinear"),
             **materials,
             **surfaces,
         ),
-        motion=upsample_motion(frame.motion, scale, jitter=frame.jitter),
+        motion=upsample_motion(frame.motion, size, jitter=frame.jitter),
         jitter=jnp.zeros_like(frame.jitter),
         reactive=up(frame.reactive, "nearest"),
         camera=None,
@@ -56,29 +57,29 @@ def enlarge(frame: Frame, scale: int, color: Color | None) -> Frame:
 
 
 @registered
-def extranet_nsrr(*, scale: int = 2, width: int = 32) -> Method:
+def extranet_nsrr(*, scale: Scale = 2, width: int = 32) -> Method:
     """ExtraNet, then NSRR on every frame. ``variables = {"extranet", "nsrr"}``, trained separately.
 
     NSRR looks back at rendered frames only, so that supersampled frames are those of ``nsrr_extranet``, as in Table 2.
 
     Args:
-      scale: whole number.
+      scale: see ``sizes.check_scale``.
       width: of NSRR.
     """
     return composed("extranet+nsrr", extranet(), nsrr(scale=scale, width=width, half=True), extrapolates=True)
 
 
 @registered
-def nsrr_extranet(*, scale: int = 2, width: int = 32) -> Method:
+def nsrr_extranet(*, scale: Scale = 2, width: int = 32) -> Method:
     """NSRR on rendered frames, then ExtraNet at output size on upsampled G-buffers. The variables of ``extranet_nsrr``.
 
     Args:
-      scale: whole number.
+      scale: see ``sizes.check_scale``.
       width: of NSRR.
     """
 
     def between(frame: Frame, image: Color) -> Frame:
-        return enlarge(frame, scale, None if frame.color is None else image)
+        return enlarge(frame, output_size(scale, frame_size(frame)), None if frame.color is None else image)
 
     first = nsrr(scale=scale, width=width, half=True)
     return composed("nsrr+extranet", first, extranet(), extrapolates=True, between=between)
@@ -101,7 +102,7 @@ def _without_gaps(seen: Inputs) -> Inputs:
 
 
 @registered
-def extranet_plus(*, scale: int = 2) -> Method:
+def extranet_plus(*, scale: Scale = 2) -> Method:
     """ExtraNet+: ExtraNet at output size on zero-upsampled frames; it fills what was disoccluded and what lies between.
 
     ``variables = {"extranet_plus": {"params", "batch_stats"}}``; ``aux`` of an extrapolated step as of ``extranet``, at
@@ -111,17 +112,20 @@ def extranet_plus(*, scale: int = 2) -> Method:
     sample or nothing, and nothing is a hole. Frames are demodulated before, and modulated with upsampled base colour.
 
     Args:
-      scale: whole number.
+      scale: see ``sizes.check_scale``.
     """
-    network = extranet_network()
+    network, scale = extranet_network(), check_scale(scale)
+
+    def size_of(frame: Frame) -> Size:
+        return output_size(scale, frame_size(frame))
 
     def samples(shading: Color, frame: Frame) -> Image:
-        """Shading and a channel > 0 where there is a sample (it is scaled like colour), ``[..., sH, sW, 4]``."""
+        """Shading and a channel > 0 where there is a sample (it is scaled like colour), ``[..., H', W', 4]``."""
         known = jnp.concatenate([shading, jnp.ones_like(shading[..., :1])], axis=-1)
-        return zero_upsample(known, scale, frame.jitter)
+        return zero_upsample(known, size_of(frame), frame.jitter)
 
     def start(example: Frame) -> Memory:
-        large = enlarge(example, scale, None)
+        large = enlarge(example, size_of(example), None)
         black = jnp.zeros((*large.motion.shape[:-1], 4), jnp.float32)
         return start_memory(large, Kept(shading=black, gbuffers=hole_buffers(large.gbuffers)), FRAMES)
 
@@ -130,14 +134,14 @@ def extranet_plus(*, scale: int = 2) -> Method:
         return {"extranet_plus": network.init(key, *input_shapes(1))}
 
     def arrive(memory: Memory, frame: Frame) -> tuple[Memory, Frame]:
-        large = enlarge(frame, scale, None)
+        large = enlarge(frame, size_of(frame), None)
         return advance(reset_memory(frame.cut, start(frame), memory), large), large
 
     def render_step(variables, history, frame, *, train=False):
         memory, large = arrive(history, frame)
         shading = demodulate(rendered_color(frame, info.name), albedo(frame.gbuffers))
         kept = Kept(shading=samples(shading, frame), gbuffers=hole_buffers(large.gbuffers))
-        return push(memory, large, kept), Prediction(image=jau_image(frame, scale))
+        return push(memory, large, kept), Prediction(image=jau_image(frame, size_of(frame)))
 
     def extrapolate_step(variables, history, frame, *, train=False):
         memory, large = arrive(history, frame)

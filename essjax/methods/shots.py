@@ -8,8 +8,9 @@ import dataclasses
 import jax.numpy as jnp
 
 from essjax.exposure import metered
-from essjax.frames import Frame
+from essjax.frames import Frame, frame_size
 from essjax.interfaces import Method, Parted, Parts, expand_flag, from_parts
+from essjax.sizes import Scale, Size, output_size
 from essjax.typing import Color, Flag, Image, Mask, Motion, PyTree, pytree
 from essjax.warp import backward_warp, jitter_aligned_upsample
 
@@ -27,31 +28,30 @@ class Shot:
     empty: Flag
 
 
-def unlit(frame: Frame, scale: float = 1) -> Color:
+def unlit(frame: Frame, scale: Scale = 1) -> Color:
     """Show a frame while nothing was rendered in its shot: its base colour as if lit evenly, else black.
 
     Base colour over exposure, which is the radiance that is displayed as the base colour.
 
     Args:
       frame: its colour is not read.
-      scale: output size over input size; at 1 the picture lies at the frame's own samples.
+      scale: of the method; at 1 the picture lies at the frame's own samples.
 
     Returns:
-      ``[..., round(scale * H), round(scale * W), 3]``.
+      ``[..., H', W', 3]``.
     """
-    base = frame.gbuffers.base_color
+    base, size = frame.gbuffers.base_color, output_size(scale, frame_size(frame))
     if base is None:
-        *lead, height, width, _ = frame.motion.shape
-        return jnp.zeros((*lead, round(scale * height), round(scale * width), 3), jnp.float32)
+        return jnp.zeros((*frame.motion.shape[:-3], *size, 3), jnp.float32)
     radiance = base / expand_flag(frame.exposure, base.ndim)
-    return radiance if scale == 1 else jitter_aligned_upsample(radiance, scale, frame.jitter)
+    return radiance if scale == 1 else jitter_aligned_upsample(radiance, size, frame.jitter)
 
 
-def upsampled_reactive(frame: Frame, scale: int) -> Mask | None:
-    """Bring the frame's reactive mask to the output's pixels, each as the nearest sample; None without one."""
+def upsampled_reactive(frame: Frame, size: Size) -> Mask | None:
+    """Bring the frame's reactive mask to an output of ``size``, each pixel as the nearest sample; None without one."""
     if frame.reactive is None:
         return None
-    return jitter_aligned_upsample(frame.reactive, scale, frame.jitter, mode="nearest")
+    return jitter_aligned_upsample(frame.reactive, size, frame.jitter, mode="nearest")
 
 
 def check_masks(earlier: Mask | None, reactive: Mask | None) -> None:
@@ -80,16 +80,15 @@ def path_trust(earlier: Mask | None, reactive: Mask | None, motion: Motion) -> M
     return (1.0 - reactive) * backward_warp(earlier, motion, mode="nearest")
 
 
-def without_history(history: Image, current: Image, frame: Frame, scale: int) -> Image:
+def without_history(history: Image, current: Image, frame: Frame) -> Image:
     """``history``, but ``current`` as far as the frame is reactive, and everywhere where it begins a shot.
 
     Args:
-      history: what was shown, at the output pixels of ``frame``, ``[..., sH, sW, C]``.
+      history: what was shown, at the output pixels of ``frame``, ``[..., H', W', C]``.
       current: what the frame's own samples show there.
       frame: its mask and whether it is a cut.
-      scale: output size over input size.
     """
-    return fade(history, current, upsampled_reactive(frame, scale), frame.cut)
+    return fade(history, current, upsampled_reactive(frame, current.shape[-3:-1]), frame.cut)
 
 
 def fade(history: Image, current: Image, reactive: Mask | None, cut: Flag) -> Image:

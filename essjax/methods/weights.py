@@ -13,9 +13,10 @@ from safetensors.numpy import save_file
 
 import essjax
 from essjax.files import atomic
-from essjax.frames import example_frame
+from essjax.frames import Frame, example_frame
 from essjax.interfaces import Method
 from essjax.methods.registry import make
+from essjax.sizes import Scale
 from essjax.typing import PyTree
 
 FORMAT = 1
@@ -50,11 +51,17 @@ def save(path: str | Path, method: Method, variables: PyTree) -> None:
             raise ValueError(f"{path}: cannot write the weights ({error}). Is the disk full?") from error
 
 
-def load(path: str | Path) -> tuple[Method, PyTree]:
+def load(path: str | Path, *, scale: Scale | None = None) -> tuple[Method, PyTree]:
     """Read what ``save`` wrote: the method, made again, and its variables.
 
+    Args:
+      path: of the file.
+      scale: make the method for another size of output, with the same variables (``extrass``, ``fasset``, ``nsrr``);
+        None: as it was saved.
+
     Raises:
-      ValueError: there is no such file; it is not a weights file, damaged, or of another version of the method.
+      ValueError: there is no such file; it is not a weights file, damaged, or of another version of the method; or the
+        method has no scale, or not that one.
     """
     path = Path(path)
 
@@ -77,7 +84,7 @@ def load(path: str | Path) -> tuple[Method, PyTree]:
         refuse(f"its format {header['format']} is newer than {FORMAT}. Update essjax to {header['version']}")
     try:
         method = _made(header)
-        wanted = _flat(jax.eval_shape(method.init, jax.random.key(0), example_frame(64, 36)))
+        wanted = _flat(jax.eval_shape(method.init, jax.random.key(0), _example(method)))
     except ValueError as error:
         refuse(f"essjax {header['version']} wrote it, and this one cannot make its method ({error})")
     shapes = [{name: (leaf.shape, str(leaf.dtype)) for name, leaf in each.items()} for each in (tensors, wanted)]
@@ -87,7 +94,16 @@ def load(path: str | Path) -> tuple[Method, PyTree]:
             f"essjax {header['version']} wrote it, whose {header['method']} is another one "
             f"({', '.join(different[:3]) or 'inputs or scale'} differ). Train it again, or use that version"
         )
-    return method, _nested(tensors)
+    return method if scale is None else _rescaled(method, scale), _nested(tensors)
+
+
+def _rescaled(method: Method, scale: Scale) -> Method:
+    """Make ``method`` again with another ``scale``."""
+    assert method.recipe is not None
+    arguments = dict(method.recipe.arguments)
+    if "scale" not in arguments:
+        raise ValueError(f"scale: {method.info.name} has none, its output has the input's size. Leave it out.")
+    return make(method.recipe.name, **{**arguments, "scale": scale})
 
 
 def _described(method: Method) -> dict[str, Any]:
@@ -104,7 +120,14 @@ def _made(described: Mapping[str, Any]) -> Method:
 
 
 def _facts(method: Method) -> dict[str, Any]:
-    return {"inputs": sorted(method.info.requires), "scale": method.info.scale}
+    scale = method.info.scale
+    return {"inputs": sorted(method.info.requires), "scale": list(scale) if isinstance(scale, tuple) else scale}
+
+
+def _example(method: Method) -> Frame:
+    """Make a frame that is not larger than the method's output."""
+    scale = method.info.scale
+    return example_frame(*(map(min, scale, (64, 36)) if isinstance(scale, tuple) else (64, 36)))
 
 
 def _flat(variables: PyTree) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """ExtraSSNet: one U-Net for supersampled and extrapolated frames (ExtraSS section 4.4, eq 10).
 
-Two encoders E0 (SS) and E1 (ESS), one decoder. All convolution runs at LR or below: HR inputs come in by
-space-to-depth, the output leaves by depth-to-space. The head predicts, per HR pixel, corrections to two logits (how
-to blend history and sample, how far to clamp history) and a residual, and starts at zero, so that the untrained network
-returns the prior blend.
+Two encoders E0 (SS) and E1 (ESS), one decoder. All convolution runs at half of the output's size or below, which is LR
+at twice the size: HR inputs come in by space-to-depth, the output leaves by depth-to-space. The head predicts, per HR
+pixel, corrections to two logits (how to blend history and sample, how far to clamp history) and a residual, and starts
+at zero, so that the untrained network returns the prior blend.
 """
 
 import flax.linen as nn
@@ -15,6 +15,8 @@ from essjax.networks.linen import from_linen
 from essjax.typing import Array, Callable, Image
 
 LEVELS = 4
+BLOCK = 2
+"""Output pixels per pixel of its finest level, in each dimension."""
 HEAD = 5
 """Outputs per HR pixel: blending logit, clamping logit, residual RGB."""
 
@@ -25,7 +27,7 @@ zeros does not depend on them."""
 
 
 class Encoder(nn.Module):
-    """Four levels at sizes 1, 1/2, 1/4, 1/8 of LR; returns their features, finest first."""
+    """Four levels at sizes 1, 1/2, 1/4, 1/8 of the half grid; returns their features, finest first."""
 
     widths: tuple[int, ...]
 
@@ -42,7 +44,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """From coarse to fine, skips concatenated; returns the head's channels at LR.
+    """From coarse to fine, skips concatenated; returns the head's channels at the finest size.
 
     Attributes:
       widths: of the encoder's levels, finest first.
@@ -69,19 +71,17 @@ class ExtraSSNet(nn.Module):
     """Both encoders and the decoder.
 
     Attributes:
-      width: channels at LR; the levels have 1, 1.5, 2 and 3 times as many.
-      scale: HR size over LR size.
+      width: channels on the half grid; the levels have 1, 1.5, 2 and 3 times as many.
     """
 
     width: int = 24
-    scale: int = 2
 
     def setup(self):
         """Make E0, E1 and D."""
         widths = (self.width, self.width * 3 // 2, self.width * 2, self.width * 3)
         self.encoder_ss = Encoder(widths)
         self.encoder_ess = Encoder(widths)
-        self.decoder = Decoder(widths, HEAD * self.scale**2)
+        self.decoder = Decoder(widths, HEAD * BLOCK**2)
 
     def _run(self, encoder: Encoder, inputs: Image, conditions: Array) -> tuple[Image, list[Image]]:
         height, width = inputs.shape[-3:-1]
@@ -89,7 +89,7 @@ class ExtraSSNet(nn.Module):
         return crop(self.decoder(features), height, width), features
 
     def render(self, inputs: Image, conditions: Array, train: bool = False) -> tuple[Image, list[Image]]:
-        """SS: ``(head [B, H, W, HEAD * scale^2], features of 4 levels)`` from E0's inputs."""
+        """SS: ``(head [B, H, W, HEAD * BLOCK^2], features of 4 levels)`` from E0's inputs."""
         return self._run(self.encoder_ss, inputs, conditions)
 
     def extrapolate(self, inputs: Image, conditions: Array, train: bool = False) -> tuple[Image, list[Image]]:
@@ -101,6 +101,6 @@ class ExtraSSNet(nn.Module):
         return self.render(inputs_ss, conditions), self.extrapolate(inputs_ess, conditions)
 
 
-def extrassnet(width: int = 24, scale: int = 2) -> Network:
+def extrassnet(width: int = 24) -> Network:
     """ExtraSSNet as a ``Network``; choose the path with ``apply(..., method="render" | "extrapolate")``."""
-    return from_linen(ExtraSSNet(width, scale))
+    return from_linen(ExtraSSNet(width))

@@ -14,6 +14,7 @@ from essjax.networks._extrassnet import Decoder
 from essjax.networks.blocks import Chain, GatedConv, conv, crop, mean_pool, pad_to_multiple, zero_conv
 from essjax.networks.linen import from_linen, kernel_bound
 from essjax.networks.precision import dot_general
+from essjax.sizes import ratios
 from essjax.typing import Array, Color, Image, Jitter, Mask
 from essjax.warp import jitter_aligned_upsample
 
@@ -153,14 +154,12 @@ class FASSET(nn.Module):
     """Feature extractor and RenderINR for both tasks.
 
     Attributes:
-      scale: output size over input size, any positive number.
       width: of the encoders; each feature map has 3 channels fewer: <= 24 keeps RenderINR below 40 K parameters.
       hidden: neurons of RenderINR's layers.
       gencoder: without it RenderINR reads the G-buffers themselves (Table 4).
       shared: one FrameEncoder for both tasks, or one each (Table 4).
     """
 
-    scale: float = 2
     width: int = 24
     hidden: int = 128
     gencoder: bool = True
@@ -187,8 +186,9 @@ class FASSET(nn.Module):
         surface = self.gbuffer_encoder(gbuffers) if self.gencoder else gbuffers
         weight, weight_surface = self.reweighting(frame, gbuffers)
         latents = jnp.concatenate([weight * features, weight_surface * surface], axis=-1)
-        queried = jnp.concatenate([jitter_aligned_upsample(latents, self.scale, jitter), local], axis=-1)
-        color, share = self.inr(queried, jnp.full((1,), 1.0 / self.scale, latents.dtype))
+        size = local.shape[-3:-1]
+        queried = jnp.concatenate([jitter_aligned_upsample(latents, size, jitter), local], axis=-1)
+        color, share = self.inr(queried, jnp.full((1,), 2.0 / sum(ratios((height, width), size)), latents.dtype))
         return color, share, hidden
 
     def render(
@@ -210,12 +210,12 @@ class FASSET(nn.Module):
           gbuffers: ``[B, H, W, 7]`` albedo, depth, normal.
           past: ``[B, H, W, PAST]`` the last image, log1p, read at this frame's samples, and whether to trust it.
           hidden: ``[B, H, W, width]`` at this frame's pixel centres.
-          local: ``[B, round(scale H), round(scale W), LOCAL]``.
+          local: ``[B, H', W', LOCAL]``: its size is the output's.
           jitter: ``[B, 2]`` of this frame, LR pixels.
           train: BatchNorm by the batch's statistics.
 
         Returns:
-          ``[B, round(scale H), round(scale W), 3]``, the same with 1 channel in (-1, 1), and ``[B, H, W, width]``.
+          ``[B, H', W', 3]``, the same with 1 channel in (-1, 1), and ``[B, H, W, width]``.
         """
         return self._run(self.frame_encoder, frame, mask, gbuffers, past, hidden, local, jitter, train)
 
@@ -240,9 +240,7 @@ class FASSET(nn.Module):
         return self.render(*inputs), self.extrapolate(*inputs)
 
 
-def fasset(
-    *, scale: float = 2, width: int = 24, hidden: int = 128, gencoder: bool = True, shared: bool = True
-) -> Network:
+def fasset(*, width: int = 24, hidden: int = 128, gencoder: bool = True, shared: bool = True) -> Network:
     """FASSET as a ``Network``; choose the task with ``apply(..., method="render" | "extrapolate")``.
 
     Raises:
@@ -250,4 +248,4 @@ def fasset(
     """
     if width < 4:
         raise ValueError(f"FASSET's width: expected at least 4 (a feature map has width - 3 channels), got {width}.")
-    return from_linen(FASSET(scale, width, hidden, gencoder, shared))
+    return from_linen(FASSET(width, hidden, gencoder, shared))

@@ -157,10 +157,10 @@ def surfaces(world: World, previous: World, x: Array, y: Array, angle: Array) ->
     }
 
 
-def screen_grid(width: int, height: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flat screen positions ``[H * W]`` of pixel centres + ``offset`` (x, y) in pixels."""
+def screen_grid(width: int, height: int, offset: np.ndarray, *, tall: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Flat screen positions ``[H * W]`` of pixel centres + ``offset`` (x, y) in pixels; ``tall`` as rendered."""
     x = (np.arange(width) + 0.5 + float(offset[0]) - 0.5 * width) / width
-    y = (np.arange(height) + 0.5 + float(offset[1]) - 0.5 * height) / width
+    y = tall * (np.arange(height) + 0.5 + float(offset[1]) - 0.5 * height) / width
     grid_x, grid_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
     return grid_x.ravel(), grid_y.ravel()
 
@@ -225,32 +225,49 @@ def pixel_angle(world: World, width: int, mip_bias: float = 0.0) -> np.float32:
     return np.float32(2.0**mip_bias / (float(world.focal) * width))
 
 
-def render_reference(world: World, width: int, height: int, *, spp: int = 64) -> np.ndarray:
-    """Anti-aliased image ``[H, W, 3]``: ``spp`` samples per pixel, box filter."""
+def _sample_offsets(spp: int, width: int, tall: float) -> np.ndarray:
+    """Screen positions of a pixel's samples, from its centre, ``[spp, 2]``."""
+    return ((reference_samples(spp) - 0.5) * [1.0, tall] / width).astype(np.float32)
+
+
+def render_reference(world: World, width: int, height: int, *, spp: int = 64, tall: float = 1.0) -> np.ndarray:
+    """Anti-aliased image ``[H, W, 3]``: ``spp`` samples per pixel, box filter.
+
+    ``tall``: height of a pixel over its width; not 1 where the image shows what one of another shape does.
+    """
     world = jax.device_put(world)
-    offsets = ((reference_samples(spp) - 0.5) / width).astype(np.float32)
+    offsets = _sample_offsets(spp, width, tall)
     angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
-    x, y = screen_grid(width, height, np.zeros(2))
+    x, y = screen_grid(width, height, np.zeros(2), tall=tall)
     return in_tiles(
         lambda a, b: {"color": average_color(world, a, b, offsets, angle)}, x, y, width, height, rays=rays, samples=spp
     )["color"]
 
 
 def render_buffers(
-    world: World, previous: World, width: int, height: int, jitter: np.ndarray, angle: np.float32
+    world: World,
+    previous: World,
+    width: int,
+    height: int,
+    jitter: np.ndarray,
+    angle: np.float32,
+    *,
+    tall: float = 1.0,
 ) -> dict[str, np.ndarray]:
     """``buffers`` and one-sample ``color`` as images ``[H, W, C]``; motion in pixels, ``stencil`` int32.
+
+    ``tall``: see ``render_reference``.
 
     ``steady`` is eroded by a pixel: a shadow's edge that passes near a sample also touches its pixel.
     """
     world, previous = jax.device_put((world, previous))
-    x, y = screen_grid(width, height, jitter)
-    half_height = np.float32(0.5 * height / width)
+    x, y = screen_grid(width, height, jitter, tall=tall)
+    half_height = np.float32(0.5 * tall * height / width)
     images = in_tiles(
         lambda a, b: buffers(world, previous, a, b, half_height, angle), x, y, width, height, rays=chunk_size() // 4
     )
     images |= in_tiles(lambda a, b: {"color": color_along(world, a, b, angle)}, x, y, width, height, rays=chunk_size())
-    images["motion"] = images["motion"] * np.float32(width)
+    images["motion"] = images["motion"] * np.asarray([width, width / tall], np.float32)
     images["stencil"] = np.rint(images["stencil"]).astype(np.int32)
     images["steady"] = _erode(images["steady"])
     return images
@@ -264,12 +281,16 @@ def _erode(mask: np.ndarray) -> np.ndarray:
 
 
 def render_statistics(
-    world: World, previous: World, width: int, height: int, *, spp: int = 64
+    world: World, previous: World, width: int, height: int, *, spp: int = 64, tall: float = 1.0
 ) -> dict[str, np.ndarray]:
-    """Render the images of ``frames.SampleRanges``, ``[H, W, C]``, and the same samples' ``reference``."""
+    """Render the images of ``frames.SampleRanges``, ``[H, W, C]``, and the same samples' ``reference``.
+
+    ``tall``: see ``render_reference``.
+    """
     world, previous = jax.device_put((world, previous))
-    offsets = ((reference_samples(spp) - 0.5) / width).astype(np.float32)
+    offsets = _sample_offsets(spp, width, tall)
     angle, rays = pixel_angle(world, width), max(chunk_size(), spp)
+    in_pixels = np.asarray([width, width / tall], np.float32)
 
     def ranges(x, y):
         places = _spread(x, y, offsets)
@@ -284,9 +305,9 @@ def render_statistics(
             "depth_min": depth.min(axis=0), "depth_max": depth.max(axis=0),
             "color_min": color.min(axis=0), "color_max": color.max(axis=0),
             "normal_spread": distance(samples["normal"]), "normal_spread_smooth": distance(samples["smooth_normal"]),
-            "motion": np.take_along_axis(samples["motion"], nearest, axis=0)[0] * np.float32(width),
+            "motion": np.take_along_axis(samples["motion"], nearest, axis=0)[0] * in_pixels,
             "reference": reference,
         }  # fmt: skip
 
-    x, y = screen_grid(width, height, np.zeros(2))
+    x, y = screen_grid(width, height, np.zeros(2), tall=tall)
     return in_tiles(ranges, x, y, width, height, rays=rays, samples=spp)

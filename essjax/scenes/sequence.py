@@ -14,6 +14,7 @@ from essjax.scenes.builder import Scene
 from essjax.scenes.jitter import jitter_sequence
 from essjax.scenes.render import pixel_angle, render_buffers, render_reference, render_statistics
 from essjax.scenes.world import World
+from essjax.sizes import Scale, output_size
 from essjax.typing import Callable
 
 
@@ -21,7 +22,7 @@ class Rendering(NamedTuple):
     """How frames of a scene are rendered.
 
     Attributes:
-      scale: reference size over frame size.
+      scale: reference size over frame size, any number >= 1, or the reference's (width, height).
       spp: samples per reference pixel.
       native: also render 1-sample frames at the reference's size; their jitter advances every frame.
       ranges: also the ranges over the reference's samples (what a classifier's labels are made of: Guo et al. 2022,
@@ -33,7 +34,7 @@ class Rendering(NamedTuple):
       jitter: pattern of the LR frames, see ``jitter_sequence``; native frames always have the default.
     """
 
-    scale: int = 2
+    scale: Scale = 2
     spp: int = 64
     native: bool = False
     ranges: bool = False
@@ -44,23 +45,23 @@ class Rendering(NamedTuple):
 USUAL = Rendering()
 
 
-def _camera(world: World, width: int, height: int) -> Camera:
+def _camera(world: World, width: int, height: int, tall: float) -> Camera:
     return Camera(
         camera_to_world=np.asarray(world.camera_to_world, np.float32),
-        focal=np.full(2, world.focal * width, np.float32),
+        focal=np.asarray([world.focal * width, world.focal * width / tall], np.float32),
         center=np.array([0.5 * width, 0.5 * height], np.float32),
     )
 
 
-def _check_size(width: int, height: int, scale: int, spp: int) -> None:
-    for name, value in (("width", width), ("height", height), ("scale", scale), ("spp", spp)):
+def _check_size(width: int, height: int, spp: int) -> None:
+    for name, value in (("width", width), ("height", height), ("spp", spp)):
         if not (isinstance(value, (int, np.integer)) and value >= 1):
             raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}.")
 
 
-def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray, angle: np.float32):
+def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray, angle: np.float32, tall: float = 1.0):
     world, previous = scene.at(index), scene.before(index)
-    images = render_buffers(world, previous, width, height, jitter, angle)
+    images = render_buffers(world, previous, width, height, jitter, angle, tall=tall)
     if scene.cut[index]:  # nothing of the frame before can be used
         images["valid"] = np.zeros_like(images["valid"])
     frame = Frame(
@@ -70,7 +71,7 @@ def _frame(scene: Scene, index: int, width: int, height: int, jitter: np.ndarray
         jitter=jitter,
         cut=np.asarray(scene.cut[index]),
         exposure=np.asarray(1.0 / scene.unit, np.float32),
-        camera=_camera(world, width, height),
+        camera=_camera(world, width, height, tall),
     )
     return frame, images["valid"], images["steady"]
 
@@ -89,20 +90,21 @@ def render_frame(scene: Scene, index: int, width: int, height: int, *, rendering
       rendering: what is rendered of it.
 
     Raises:
-      ValueError: a size is not a positive whole number, there is no frame ``index``, or no such jitter pattern.
+      ValueError: a size is not a positive whole number, no such scale, no frame ``index``, or no such jitter pattern.
     """
     scale, spp, native, ranges, mip_bias, jitter = rendering
-    _check_size(width, height, scale, spp)
+    _check_size(width, height, spp)
+    high, wide = output_size(scale, (height, width))
+    tall = height * wide / (width * high)  # both show the same, to the border
     offset = jitter_sequence(index + 1, pattern=jitter, scale=scale)[index]
     world = scene.at(index)
-    wide, high = width * scale, height * scale
     angle = pixel_angle(world, wide, mip_bias)
     native_frame = None
 
     def from_samples() -> tuple[np.ndarray, SampleRanges | None]:
         if not ranges:
-            return render_reference(world, wide, high, spp=spp) * np.float32(scene.unit), None
-        images = render_statistics(world, scene.before(index), wide, high, spp=spp)
+            return render_reference(world, wide, high, spp=spp, tall=tall) * np.float32(scene.unit), None
+        images = render_statistics(world, scene.before(index), wide, high, spp=spp, tall=tall)
         return images["reference"] * np.float32(scene.unit), _ranges(images, scene.unit)
 
     # Beside the buffers, so that the two compilations of the first frame run at the same time.
@@ -111,7 +113,7 @@ def render_frame(scene: Scene, index: int, width: int, height: int, *, rendering
         frame, valid, steady = _frame(scene, index, width, height, offset, angle)
         if native:
             offset = jitter_sequence(index + 1)[index]
-            native_frame, _, _ = _frame(scene, index, wide, high, offset, angle)
+            native_frame, _, _ = _frame(scene, index, wide, high, offset, angle, tall)
     reference, found = sampled.result()
     return Sequence(frames=frame, reference=reference, valid=valid, steady=steady, native=native_frame, ranges=found)
 

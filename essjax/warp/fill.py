@@ -25,7 +25,8 @@ def _pull_push(mean: Array, weight: Array) -> Array:
     total = _block_sums(weight)
     coarse = _block_sums(weight * mean) / jnp.maximum(total, _SMALL)
     coarse = _pull_push(coarse, jnp.minimum(total, 1.0))  # one valid pixel of four is as good as four
-    fine = jitter_aligned_upsample(coarse, 2, jnp.zeros(2, jnp.float32))[..., :height, :width, :]
+    size = 2 * coarse.shape[-3], 2 * coarse.shape[-2]
+    fine = jitter_aligned_upsample(coarse, size, jnp.zeros(2, jnp.float32))[..., :height, :width, :]
     return weight * mean + (1.0 - weight) * fine
 
 

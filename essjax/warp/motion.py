@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from essjax.cameras import pixel_positions
+from essjax.sizes import Size, ratios
 from essjax.typing import Array, Image, Jitter, Mask, Motion, Places, Plane
 from essjax.warp._batch import check_channels
 from essjax.warp._splat import splat_nearest
@@ -70,24 +71,26 @@ def compose_motion(
     return total, valid
 
 
-def upsample_motion(motion: Motion, scale: float, *, jitter: Jitter | None = None, mode: str = "bilinear") -> Places:
-    """Motion at a higher resolution, in its pixels: values times ``scale``.
+def upsample_motion(motion: Motion, size: Size, *, jitter: Jitter | None = None, mode: str = "bilinear") -> Places:
+    """Motion at a higher resolution, in its pixels: values times the ratio of each axis.
 
-    HR pixel P reads at (P + 0.5) / scale - jitter, because LR motion is stored at the jittered sample positions
+    HR pixel P reads at (P + 0.5) / ratio - jitter, because LR motion is stored at the jittered sample positions
     (SPEC 0).
 
     Args:
       motion: ``[..., H, W, 2]`` LR pixels.
-      scale: output size over input size.
+      size: (height, width) of the output.
       jitter: ``[..., 2]`` of the frame, LR pixels; 0 if None.
       mode: "nearest" keeps silhouettes sharp, "bilinear" keeps motion smooth; see ``sample``.
 
     Returns:
-      ``[..., round(scale * H), round(scale * W), 2]`` HR pixels.
+      ``[..., *size, 2]`` HR pixels.
     """
     check_channels("motion", motion, 2)
     jitter = jnp.zeros(2, motion.dtype) if jitter is None else jitter
-    return jitter_aligned_upsample(motion, scale, jitter, mode=mode) * scale
+    upsampled = jitter_aligned_upsample(motion, size, jitter, mode=mode)
+    along_x, along_y = ratios(motion.shape[-3:-1], size)
+    return upsampled * (along_x if along_x == along_y else jnp.array([along_x, along_y], motion.dtype))
 
 
 def _shifted(image: Array, dy: int, dx: int, radius: int, height: int, width: int) -> Array:

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from essjax.sizes import Size, check_size
 from essjax.typing import Array, Guide, Image, Jitter, Mask
 from essjax.warp._batch import check_channels
 from essjax.warp.sampling import gather_pixels
-from essjax.warp.upsample import check_jitter, check_scale, zero_upsample
+from essjax.warp.upsample import check_jitter, zero_upsample
 
 
 class Resampled(NamedTuple):
@@ -32,29 +33,30 @@ class Resampled(NamedTuple):
     average: Array
 
 
-def _nearest_three(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Array]:
-    """Find the LR samples next to each output pixel on one axis, ``[3, scale * size]`` indices, the nearest first.
+def _nearest_three(size: int, output: int, jitter: Array) -> tuple[Array, Array, Array]:
+    """Find the LR samples next to each output pixel on one axis, ``[3, output]`` indices, the nearest first.
 
     Returns:
       The indices, which may lie one outside; the distance to them in output pixels; whether they are inside.
     """
-    position = (jnp.arange(size * scale, dtype=jnp.float32) + 0.5) / scale
+    ratio = output / size
+    position = (jnp.arange(output, dtype=jnp.float32) + 0.5) / ratio
     nearest = jnp.clip(jnp.floor(position - jitter), 0, size - 1)
     index = nearest[None] + jnp.array([[0.0], [-1.0], [1.0]], jnp.float32)
-    distance = (index + 0.5 + jitter - position) * scale
+    distance = (index + 0.5 + jitter - position) * ratio
     return index, distance, (index >= 0) & (index < size)
 
 
-def _gaussian_axis(size: int, scale: int, jitter: Array, sigma: Array) -> tuple[Array, Array, Array]:
+def _gaussian_axis(size: int, output: int, jitter: Array, sigma: Array) -> tuple[Array, Array, Array]:
     """Return indices, normalised weights, and the logarithm of the largest weight before normalisation."""
-    index, distance, inside = _nearest_three(size, scale, jitter)
+    index, distance, inside = _nearest_three(size, output, jitter)
     log_weight = jnp.where(inside, -0.5 * (distance / sigma) ** 2, -jnp.inf)
     return index, jax.nn.softmax(log_weight, axis=0), log_weight[0]
 
 
-def _tent_axis(size: int, scale: int, jitter: Array) -> tuple[Array, Array, Array]:
+def _tent_axis(size: int, output: int, jitter: Array) -> tuple[Array, Array, Array]:
     """Return indices and normalised weights (0 where no sample is within a pixel); no logarithm is needed."""
-    index, distance, inside = _nearest_three(size, scale, jitter)
+    index, distance, inside = _nearest_three(size, output, jitter)
     weight = jnp.where(inside, jnp.maximum(1.0 - jnp.abs(distance), 0.0), 0.0)
     total = weight.sum(axis=0)
     return index, weight / jnp.where(total > 0, total, 1.0), jnp.zeros_like(total)
@@ -79,10 +81,10 @@ _MERGES: tuple[Callable, ...] = (
 )
 
 
-def _resample_one(color: Array, bounded: Array, jitter: Array, axis: Callable) -> Resampled:
+def _resample_one(color: Array, bounded: Array, jitter: Array, output: Size, axis: Callable) -> Resampled:
     height, width = color.shape[:2]
-    columns, column_weight, column_log = axis(width, jitter[0])
-    rows, row_weight, row_log = axis(height, jitter[1])
+    columns, column_weight, column_log = axis(width, output[1], jitter[0])
+    rows, row_weight, row_log = axis(height, output[0], jitter[1])
     columns = jnp.clip(columns, 0, width - 1).astype(jnp.int32)
     rows = jnp.clip(rows, 0, height - 1).astype(jnp.int32)
     # Barriers: fused into what reads it three times, each stage would be computed three times for every pixel.
@@ -99,20 +101,20 @@ def _resample_one(color: Array, bounded: Array, jitter: Array, axis: Callable) -
     return Resampled(jnp.asarray(mean), weight, low, high, average)
 
 
-def _resample(color: Image, bounded: Image, jitter: Jitter, axis: Callable) -> Resampled:
+def _resample(color: Image, bounded: Image, jitter: Jitter, size: Size, axis: Callable) -> Resampled:
     check_channels("color", color, None)
     check_channels("bounded", bounded, None, color.shape[-3:-1])
-    jitter = check_jitter(jitter)
+    size, jitter = check_size(size), check_jitter(jitter)
     leading = jnp.broadcast_shapes(color.shape[:-3], bounded.shape[:-3], jitter.shape[:-1])
     flat = [
         jnp.broadcast_to(x, (*leading, *core)).reshape(math.prod(leading), *core)
         for x, core in ((color, color.shape[-3:]), (bounded, bounded.shape[-3:]), (jitter, (2,)))
     ]
-    results = jax.vmap(lambda c, b, j: _resample_one(c, b, j, axis))(*flat)
+    results = jax.vmap(lambda c, b, j: _resample_one(c, b, j, size, axis))(*flat)
     return jax.tree.map(lambda x: x.reshape(*leading, *x.shape[1:]), results)
 
 
-def gaussian_resample(color: Image, bounded: Guide, jitter: Jitter, sigma: Array, scale: int) -> Resampled:
+def gaussian_resample(color: Image, bounded: Guide, jitter: Jitter, sigma: Array, size: Size) -> Resampled:
     """Resample LR samples to the output grid with a Gaussian over the 3 x 3 nearest (thesis 002 eq 38, 41, 42).
 
     Args:
@@ -120,20 +122,19 @@ def gaussian_resample(color: Image, bounded: Guide, jitter: Jitter, sigma: Array
       bounded: ``[..., H, W, C]``, the colour in the space whose minimum and maximum are wanted.
       jitter: ``[..., 2]`` LR pixels.
       sigma: standard deviation in *output* pixels (our reading: eq 40 measures distance in them), a scalar array.
-      scale: whole number.
+      size: (height, width) of the output.
 
     Raises:
-      ValueError: the scale is no whole number >= 1, or wrong shapes.
+      ValueError: wrong shapes.
     """
-    scale = check_scale(scale)
-    return _resample(color, bounded, jitter, lambda size, j: _gaussian_axis(size, scale, j, sigma))
+    return _resample(color, bounded, jitter, size, lambda *axis: _gaussian_axis(*axis, sigma))
 
 
-def tent_resample(color: Image, bounded: Guide, jitter: Jitter, scale: int) -> Resampled:
+def tent_resample(color: Image, bounded: Guide, jitter: Jitter, size: Size) -> Resampled:
     """Resample with a tent of one output pixel (eq 38, 40); β is 1 in the pixel that a sample fell into, else 0.
 
-    The colour is 0 where no sample is within a pixel, as is β there. Arguments and errors as ``gaussian_resample``.
+    The colour is 0 where no sample is within a pixel, as is β there. Arguments and errors as ``gaussian_resample``; the
+    size must be the image's or larger.
     """
-    scale = check_scale(scale)
-    resampled = _resample(color, bounded, jitter, lambda size, j: _tent_axis(size, scale, j))
-    return resampled._replace(weight=zero_upsample(jnp.ones_like(color[..., :1]), scale, jitter))
+    resampled = _resample(color, bounded, jitter, size, _tent_axis)
+    return resampled._replace(weight=zero_upsample(jnp.ones_like(color[..., :1]), size, jitter))

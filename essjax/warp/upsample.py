@@ -6,16 +6,17 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from essjax.sizes import Size, check_size, whole_ratio
 from essjax.typing import Array, Float, Image, Jitter, Places, Resized
 from essjax.warp._batch import check_channels, over_leading_axes
 from essjax.warp.sampling import Tap, axis_taps, check_mode, gather_pixels, sample
 
 
-def check_scale(scale: int, name: str = "scale") -> int:
-    """Return the scale as an int; raise a ValueError unless it is a whole number >= 1."""
-    if int(scale) != scale or scale < 1:
-        raise ValueError(f"{name}: expected a whole number >= 1, got {scale!r}.")
-    return int(scale)
+def check_block(block: int) -> int:
+    """Return the side of a block as an int; raise a ValueError unless it is a whole number >= 1."""
+    if int(block) != block or block < 1:
+        raise ValueError(f"block: expected a whole number >= 1, got {block!r}.")
+    return int(block)
 
 
 def check_jitter(jitter: Jitter | Sequence[float]) -> Array:
@@ -31,74 +32,114 @@ def _sample_offset(jitter: Jitter, scale: int) -> Array:
     return jnp.clip(jnp.floor((jitter + 0.5) * scale), 0, scale - 1)  # the clip is for rounding at 0.5
 
 
-def zero_upsample(image: Image, scale: int, jitter: Jitter) -> Resized:
+def _check_enlarges(size: Size, image: Image) -> Size:
+    """Return the size; a ValueError unless it is the image's or larger: two samples cannot lie in one pixel."""
+    size, (height, width) = check_size(size), image.shape[-3:-1]
+    if size[0] < height or size[1] < width:
+        raise ValueError(f"size: expected at least the image's {width}x{height}, got {size[1]}x{size[0]}.")
+    return size
+
+
+def _fallen(pixels: Array, size: int, output: int, jitter: Array) -> tuple[Array, Array]:
+    """Find which LR sample fell into each of the output ``pixels`` of an axis: its index, and whether one did."""
+    ratio = output / size
+    index = jnp.clip(jnp.floor((pixels + 0.5) / ratio - jitter), 0, size - 1)  # the nearest: no other can have
+    place = (index + 0.5 + jitter) * ratio
+    last = index == size - 1  # rounding at the end of the image
+    hit = (jnp.floor(place) == pixels) | (last & (pixels == output - 1) & (place >= output))
+    return index.astype(jnp.int32), hit
+
+
+def zero_upsample(image: Image, size: Size, jitter: Jitter) -> Resized:
     """Each LR sample in the HR pixel that it fell into, 0 elsewhere (DLCTUS; SPEC 4).
 
-    The HR pixel is ``scale * p + floor((jitter + 0.5) * scale)``. Upsample an image of ones for the mask.
+    The sample of pixel p lies at ``ratio * (p + 0.5 + jitter)``. Upsample an image of ones for the mask.
 
     Args:
       image: ``[..., H, W, C]``.
-      scale: whole number.
+      size: (height, width) of the output, at least the image's.
       jitter: ``[..., 2]`` (x, y) LR pixels in [-0.5, 0.5).
 
     Returns:
-      ``[..., scale * H, scale * W, C]``.
+      ``[..., *size, C]``.
 
     Raises:
-      ValueError: the scale is no whole number >= 1, or wrong shapes.
+      ValueError: the size is smaller, or wrong shapes.
     """
-    scale = check_scale(scale)
     check_channels("image", image, None)
+    size, jitter = _check_enlarges(size, image), check_jitter(jitter)
     height, width, channels = image.shape[-3:]
-    offset = _sample_offset(check_jitter(jitter), scale)
-    here = jnp.arange(scale) == offset[..., None]  # [..., 2, scale]: x, y
-    hit = (here[..., 1, :, None] & here[..., 0, None, :])[..., None, :, None, :, None]
-    blocks = jnp.where(hit, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
-    return blocks.reshape(*blocks.shape[:-5], height * scale, width * scale, channels)
+    scale = whole_ratio((height, width), size)
+    if scale is not None:  # without a gather
+        offset = _sample_offset(jitter, scale)
+        here = jnp.arange(scale) == offset[..., None]  # [..., 2, scale]: x, y
+        hit = (here[..., 1, :, None] & here[..., 0, None, :])[..., None, :, None, :, None]
+        blocks = jnp.where(hit, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
+        return blocks.reshape(*blocks.shape[:-5], *size, channels)
+
+    def one(image: Array, jitter: Array) -> Array:
+        columns, across = _fallen(jnp.arange(size[1]), width, size[1], jitter[0])
+        rows, down = _fallen(jnp.arange(size[0]), height, size[0], jitter[1])
+        value = gather_pixels(image.reshape(-1, channels), rows[:, None] * width + columns)
+        return jnp.where((down[:, None] & across)[..., None], value, jnp.zeros((), image.dtype))
+
+    return over_leading_axes(one, (3, 1), image, jitter)
 
 
-def _sparse_taps(positions: Array, size: int, scale: int, offset: Array) -> Tap:
-    """Which LR pixel bilinear interpolation of the zero-upsampled axis meets, and its weight: one of two neighbours."""
-    index = jnp.zeros(positions.shape, jnp.int32)
-    weight = jnp.zeros(positions.shape, jnp.float32)
-    for tap in axis_taps(positions, size * scale, "bilinear", "zeros"):
-        hit = (tap.index % scale == offset) & (tap.weight > 0)
-        index = jnp.where(hit, tap.index // scale, index)
-        weight = jnp.where(hit, tap.weight, weight)
-    return Tap(index, weight)
+def _sparse_taps(positions: Array, size: int, output: int, jitter: Array) -> list[Tap]:
+    """Which LR pixels bilinear interpolation of the zero-upsampled axis meets, with their weights: up to two.
+
+    At twice the size or more one of them at most holds a sample: the other is left out.
+    """
+    scale = output // size if output % size == 0 else None
+    taps = []
+    for tap in axis_taps(positions, output, "bilinear", "zeros"):
+        if scale is None:
+            index, hit = _fallen(tap.index, size, output, jitter)
+        else:
+            index, hit = tap.index // scale, tap.index % scale == _sample_offset(jitter, scale).astype(jnp.int32)
+        taps.append(Tap(index, jnp.where(hit, tap.weight, 0.0)))
+    if output < 2 * size:
+        return taps
+    near, far = taps
+    met = far.weight > 0
+    return [Tap(jnp.where(met, far.index, near.index), jnp.where(met, far.weight, near.weight))]
 
 
-def sample_zero_upsampled(image: Image, positions: Places, scale: int, jitter: Jitter) -> Resized:
-    """``sample(zero_upsample(image, scale, jitter), positions, outside="zeros")`` without making the large image.
+def sample_zero_upsampled(image: Image, positions: Places, size: Size, jitter: Jitter) -> Resized:
+    """``sample(zero_upsample(image, size, jitter), positions, outside="zeros")`` without making the large image.
 
-    Of the four HR pixels that bilinear interpolation reads, one at most holds a sample: one gather instead of four,
-    and the gradient to the image is one scatter.
+    From twice the size on, of the four HR pixels that bilinear interpolation reads one at most holds a sample: one
+    gather instead of four, and the gradient to the image is one scatter.
 
     Args:
       image: ``[..., H, W, C]``.
       positions: ``[..., h, w, 2]`` (x, y) in HR pixels, centres at +0.5; no gradient.
-      scale: whole number.
+      size: (height, width) of the large image, at least the small one's.
       jitter: ``[..., 2]`` (x, y) LR pixels in [-0.5, 0.5) of the image.
 
     Returns:
       ``[..., h, w, C]``.
 
     Raises:
-      ValueError: the scale is no whole number >= 1, or wrong shapes.
+      ValueError: the size is smaller, or wrong shapes.
     """
-    scale, jitter = check_scale(scale), check_jitter(jitter)
-    if scale == 1:
-        return sample(image, positions, outside="zeros")
     check_channels("image", image, None)
     check_channels("positions", positions, 2)
+    size, jitter = _check_enlarges(size, image), check_jitter(jitter)
+    if size == image.shape[-3:-1]:
+        return sample(image, positions, outside="zeros")
 
     def one(image: Array, positions: Array, jitter: Array) -> Array:
         height, width, channels = image.shape
-        offset = _sample_offset(jitter, scale).astype(jnp.int32)
-        column = _sparse_taps(positions[..., 0], width, scale, offset[0])
-        row = _sparse_taps(positions[..., 1], height, scale, offset[1])
-        value = gather_pixels(image.reshape(-1, channels), row.index * width + column.index)
-        return value * (row.weight * column.weight)[..., None].astype(image.dtype)
+        columns = _sparse_taps(positions[..., 0], width, size[1], jitter[0])
+        rows = _sparse_taps(positions[..., 1], height, size[0], jitter[1])
+        flat, values = image.reshape(-1, channels), []
+        for row in rows:
+            for column in columns:
+                value = gather_pixels(flat, row.index * width + column.index)
+                values.append(value * (row.weight * column.weight)[..., None].astype(image.dtype))
+        return functools.reduce(jnp.add, values)
 
     return over_leading_axes(one, (3, 3, 1), image, jax.lax.stop_gradient(positions), jitter)
 
@@ -113,30 +154,31 @@ def _along(image: Array, taps: list[Tap], axis: int) -> Array:
     return functools.reduce(jnp.add, weighted)
 
 
-def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode: str = "bilinear") -> Resized:
-    """JAU: HR pixel P reads the LR image at (P + 0.5) / scale - jitter, where its samples really are (SPEC 4).
+def jitter_aligned_upsample(image: Image, size: Size, jitter: Jitter, *, mode: str = "bilinear") -> Resized:
+    """JAU: HR pixel P reads the LR image at (P + 0.5) / ratio - jitter, where its samples really are (SPEC 4).
 
     All rows share their vertical position and all columns their horizontal one, so it is two 1-D interpolations.
 
     Args:
       image: ``[..., H, W, C]`` sampled at pixel centres + jitter.
-      scale: output size over input size; sizes are rounded.
+      size: (height, width) of the output; each axis has the ratio that follows.
       jitter: ``[..., 2]`` (x, y) LR pixels; zeros give ordinary upsampling.
       mode: see ``sample``; the border repeats.
 
     Returns:
-      ``[..., round(scale * H), round(scale * W), C]``; of integers float32, except that "nearest" keeps them.
+      ``[..., *size, C]``; of integers float32, except that "nearest" keeps them.
 
     Raises:
-      ValueError: unknown mode, wrong shapes, or a scale that is not positive.
+      ValueError: unknown mode, or wrong shapes.
     """
     check_mode(mode)
     check_channels("image", image, None)
-    jitter = check_jitter(jitter)
-    if not scale > 0:
-        raise ValueError(f"scale: expected a positive number, got {scale!r}.")
+    size, jitter = check_size(size), check_jitter(jitter)
     height, width = image.shape[-3:-1]
-    rows, columns = ((jnp.arange(round(n * scale), dtype=jnp.float32) + 0.5) / scale for n in (height, width))
+    rows, columns = (
+        (jnp.arange(output, dtype=jnp.float32) + 0.5) / (output / n)
+        for output, n in zip(size, (height, width), strict=True)
+    )
 
     def one(image: Array, jitter: Array) -> Array:
         wide = _along(image, axis_taps(columns - jitter[0], width, mode, "border"), axis=1)
@@ -147,6 +189,23 @@ def jitter_aligned_upsample(image: Image, scale: float, jitter: Jitter, *, mode:
     return over_leading_axes(one, (3, 1), image, jitter)
 
 
+def nearest_upsample(image: Image, size: Size) -> Resized:
+    """Each output pixel shows the LR pixel that its centre lies in, jitter or not: blocks where the ratio is whole.
+
+    Args:
+      image: ``[..., H, W, C]``.
+      size: (height, width) of the output.
+
+    Returns:
+      ``[..., *size, C]``, of the image's type.
+    """
+    check_channels("image", image, None)
+    factor = whole_ratio(image.shape[-3:-1], check_size(size))
+    if factor is not None:
+        return jnp.repeat(jnp.repeat(image, factor, axis=-3), factor, axis=-2)
+    return jitter_aligned_upsample(image, size, (0.0, 0.0), mode="nearest")
+
+
 def space_to_depth(x: Image, block: int) -> Float[Array, "... H W C"]:
     """Fold blocks of pixels into channels: ``[..., H, W, C]`` to ``[..., H / block, W / block, block^2 C]``.
 
@@ -155,7 +214,7 @@ def space_to_depth(x: Image, block: int) -> Float[Array, "... H W C"]:
     Raises:
       ValueError: H or W is not a multiple of ``block``.
     """
-    block = check_scale(block, "block")
+    block = check_block(block)
     height, width, channels = x.shape[-3:]
     if height % block or width % block:
         raise ValueError(
@@ -172,7 +231,7 @@ def depth_to_space(x: Image, block: int) -> Float[Array, "... H W C"]:
     Raises:
       ValueError: the channels are not a multiple of ``block``^2.
     """
-    block = check_scale(block, "block")
+    block = check_block(block)
     height, width, channels = x.shape[-3:]
     if channels % block**2:
         raise ValueError(f"depth_to_space: expected a multiple of {block**2} channels, got {channels}.")

@@ -15,7 +15,7 @@ from rich.console import Console
 from experiments.benchmark.schema import SIZE
 from experiments.run import guarded, parse_as
 
-SUITES = ("warp", "networks", "pipeline", "train", "scenes")
+SUITES = ("warp", "networks", "pipeline", "ratios", "train", "scenes")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Command:
     """Time essjax and its peers; results go to experiments/results."""
 
     suite: tuple[str, ...] = SUITES
-    """some of warp, networks, pipeline, train, scenes"""
+    """some of warp, networks, pipeline, ratios, train, scenes"""
     device: str | None = None
     """cpu or gpu; JAX's choice without it"""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = SIZE
@@ -31,7 +31,7 @@ class Command:
     repetitions: int = 20
     """of each case"""
     frames: int = 300
-    """streamed by the pipeline suite"""
+    """streamed by the suites pipeline and ratios"""
     dtypes: tuple[str, ...] = ("float32", "bfloat16")
     """of networks"""
     only: tuple[str, ...] = ()

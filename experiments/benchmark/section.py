@@ -11,6 +11,7 @@ NOTES = {
     "pipeline": "Whole methods, weights built in, frame by frame: the frame to the device and the image back included, "
     "history donated, any other transfer refused. Difference: largest between streamed and unrolled images, over their "
     "mean.",
+    "ratios": "As pipeline, of one output size; the row says the input's. x2 is pipeline's.",
     "train": "Both rollouts of ExtraSS, all losses, gradient and Adam; networks of 24 channels.",
     "scenes": "The built-in renderer, from outside: many jitted pieces.",
 }

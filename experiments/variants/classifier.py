@@ -7,6 +7,7 @@ from typing import Any
 from essjax import methods
 from essjax.interfaces import Method
 from essjax.labels import Thresholds
+from essjax.sizes import output_size
 from essjax.train import classification_objective, composition_objective
 from experiments.classes import QUESTIONS, class_remark, evaluate_classes
 from experiments.evaluate import Clip
@@ -17,7 +18,7 @@ from experiments.variants.base import Found, Page, StageRecipe, Variant
 
 def thresholds(settings: Settings) -> Thresholds:
     """Those of the labels at the size of a run's reference."""
-    return Thresholds.of_height(settings.data.size[1] * settings.data.scale)
+    return Thresholds.of_height(output_size(settings.data.scale, settings.data.size[::-1])[0])
 
 
 def _inspect(method: Method, variables: Any, clips: Sequence[Clip], settings: Settings, folder: Path) -> Found | None:

@@ -26,7 +26,7 @@ from tests.helpers import make_sequence
 H, W, T = 8, 12, 9
 
 
-def coordinates(number: int, cuts=(0,), H=H, W=W, T=T):
+def coordinates(number: int, cuts=(0,), H=H, W=W, T=T, output=None):
     """A sequence in which every colour says where it is: (x, y, 100 * sequence + frame), in LR pixels."""
     base = jax.tree.map(lambda leaf: np.array(leaf[:, 0]), make_sequence(number, T, 1, H, W))
 
@@ -37,7 +37,7 @@ def coordinates(number: int, cuts=(0,), H=H, W=W, T=T):
 
     cut = np.isin(np.arange(T), cuts)
     frames = dataclasses.replace(base.frames, color=grid(H, W), cut=cut)
-    return dataclasses.replace(base, frames=frames, reference=grid(2 * H, 2 * W))
+    return dataclasses.replace(base, frames=frames, reference=grid(*(output or (2 * H, 2 * W))))
 
 
 def take(iterable, count):
@@ -250,6 +250,24 @@ def test_sequences_with_and_without_cameras_do_not_go_together(tmp_path):
         clips(disk_source(dataset, "train"), length=2, batch=1)
     with pytest.raises(ValueError, match="a crop of 13x4 does not fit into sequence 0 of 12x8"):
         clips(disk_source(dataset, "train"), length=2, batch=1, crop=(4, 13))
+
+
+def test_crops_at_a_ratio_that_is_not_whole_begin_where_the_reference_has_a_pixel():
+    source = [coordinates(0, output=(12, 18))]
+    for clip in take(clips(source, length=2, batch=4, crop=(4, 6), flips=False), 4):
+        assert clip.frames.color.shape[2:] == (4, 6, 3) and clip.reference.shape[2:] == (6, 9, 3)
+        np.testing.assert_array_equal(clip.reference[:, :, ::3, ::3], clip.frames.color[:, :, ::2, ::2])
+    whole = next(iter(clips([coordinates(0, output=(11, 17))], length=2, batch=1, flips=False)))
+    assert whole.reference.shape == (2, 1, 11, 17, 3)
+
+
+def test_crops_that_have_no_whole_reference_are_refused():
+    with pytest.raises(ValueError, match="references of 18x12: expected a crop of multiples of 2x2, .* got 6x5"):
+        clips([coordinates(0, output=(12, 18))], length=2, batch=1, crop=(5, 6))
+    with pytest.raises(ValueError, match="references of 17x11: crops need a ratio with denominators of at most 8"):
+        clips([coordinates(0, output=(11, 17))], length=2, batch=1, crop=(4, 6))
+    with pytest.raises(ValueError, match=r"crop: 6x4 at \(1, 0\) .* no whole number of pixels of a reference of 18x12"):
+        crop(coordinates(0, output=(12, 18)), 0, 1, 4, 6)
 
 
 def test_sequences_with_and_without_exposure_do_not_go_together(tmp_path):

@@ -64,7 +64,6 @@ def imported(tmp_path_factory):
     ("arguments", "message"),
     [
         (["--variant", "fasset"], "fasset cannot run on it: this dataset has no base_color, normal."),
-        (["--variant", "nsrr", "--set", "data.scale=4"], "nsrr cannot run on it: it enlarges 4 times, this dataset's"),
         (["--variant", "nsrr", "--set", "data.fresh=3"], "was not made by the built-in renderer"),
         (["--variant", "nsrr", "--set", "nsrr.crop=[24,16]"], "got 24x16 from crop (24, 16) of 32x24 frames"),
         (

@@ -335,8 +335,8 @@ def test_settings_are_runtime_arrays():
 def test_errors():
     with pytest.raises(ValueError, match="clamp: expected one of none, rgb, ycocg, got 'hsv'"):
         methods.taau(clamp="hsv")
-    with pytest.raises(ValueError, match="scale: expected a whole number >= 1, got 1.5"):
-        methods.taau(scale=1.5)
+    with pytest.raises(ValueError, match="scale: expected a number >= 1 or the output's .width, height., got 0.5"):
+        methods.taau(scale=0.5)
     with pytest.raises(ValueError, match="expected 0 < alpha <= 1 and sigma > 0, got alpha = 2"):
         methods.taau_half(alpha=2)
     frames = random_frames()

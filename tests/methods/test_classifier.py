@@ -99,7 +99,7 @@ KNOWN[:-2, 4:] = True
 
 @jax.jit
 def bicubic(frame):
-    return jnp.clip(jitter_aligned_upsample(reinhard(frame.color), 2, frame.jitter, mode="bicubic"), 0, 1)
+    return jnp.clip(jitter_aligned_upsample(reinhard(frame.color), (2 * H, 2 * W), frame.jitter, mode="bicubic"), 0, 1)
 
 
 @pytest.mark.parametrize("logits", [VISIBILITY, SHADING, NONE], ids=["visibility", "shading", "none"])
@@ -146,7 +146,7 @@ def test_the_classifier_sees_what_the_paper_lists(untrained):
     assert inputs.shape == (B, 2 * H, 2 * W, 20)
     np.testing.assert_allclose(inputs[..., :3], bicubic(second), atol=1e-6)
     unit = np.asarray(history.depth_scale)[:, None, None, None]
-    depth = jitter_aligned_upsample(second.gbuffers.depth, 2, second.jitter, mode="nearest")
+    depth = jitter_aligned_upsample(second.gbuffers.depth, (2 * H, 2 * W), second.jitter, mode="nearest")
     reversed_now = np.where(np.isinf(depth), 0, unit / depth)
     np.testing.assert_allclose(inputs[..., 3:4], reversed_now / (1 + reversed_now), rtol=1e-5)
     np.testing.assert_allclose(
@@ -191,7 +191,9 @@ def test_a_reactive_pixel_has_no_history(untrained):
     history, _ = step(variables, METHOD.start(select_time(frames, 0)), select_time(frames, 0))
     _, prediction = step(variables, history, select_time(frames, 1))
     rejected, second = prediction.aux["ghosting"][..., 0], select_time(frames, 1)
-    mask = jitter_aligned_upsample(second.reactive, 2, second.jitter, mode="nearest")[..., 0]  # of the nearest sample
+    mask = jitter_aligned_upsample(second.reactive, (2 * H, 2 * W), second.jitter, mode="nearest")[
+        ..., 0
+    ]  # of the nearest sample
     assert 2 * B <= float(mask.sum()) <= 6 * B
     np.testing.assert_array_equal(rejected[mask > 0], 1.0)
     assert (rejected[:, 4:6, 6:8] < 1e-6).all()

@@ -99,7 +99,7 @@ def test_with_taa_it_has_the_variables_of_the_first(first):
 
 
 def test_taa_needs_frames_of_one_size():
-    with pytest.raises(ValueError, match="with_taa: expected a method of scale 1, got jau of 2"):
+    with pytest.raises(ValueError, match="with_taa: expected a method of scale 1, got jau of x2"):
         with_taa(jau(scale=2))
 
 

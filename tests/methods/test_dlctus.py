@@ -130,7 +130,8 @@ def step_oracle(params, history, color, depth, motion, jitter, scale, accumulati
 
 @functools.partial(jax.jit, static_argnames="scale")
 def upsample(rgbd, jitter, scale):
-    return zero_upsample(rgbd, scale, jitter), jitter_aligned_upsample(rgbd[..., :3], scale, jitter)
+    size = scale * rgbd.shape[-3], scale * rgbd.shape[-2]
+    return zero_upsample(rgbd, size, jitter), jitter_aligned_upsample(rgbd[..., :3], size, jitter)
 
 
 @pytest.mark.parametrize("scale", [2, 4])

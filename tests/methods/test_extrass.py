@@ -258,7 +258,9 @@ def test_history_beside_a_lamp_does_not_ring():
     height, width = frame.motion.shape[-3:-1]
     frame = dataclasses.replace(frame, motion=jnp.full_like(frame.motion, 0.25), cut=jnp.zeros_like(frame.cut))
     image = jnp.ones((frame.motion.shape[0], 2 * height, 2 * width, 3)).at[:, 9, 11].set(1000.0)
-    warped = jax.jit(lambda image, frame: warp_shown(image, history_motion(frame, 2)))(image, frame)
+    warped = jax.jit(lambda image, frame: warp_shown(image, history_motion(frame, (2 * height, 2 * width))))(
+        image, frame
+    )
     assert float(jnp.expm1(warped).min()) > 0.7
     assert float(jnp.expm1(warped[:, 9, 11]).max()) < 1000
 

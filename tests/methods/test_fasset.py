@@ -338,12 +338,12 @@ def test_texture_is_that_of_the_current_frame(untrained, kind):
     frames = dataclasses.replace(frames, color=jnp.where(sky, light * albedo(gbuffers), color), gbuffers=gbuffers)
     second = select_time(frames, 1)
     image = images_of(untrained, frames, (SS, kind))[1]
-    expected = jitter_aligned_upsample(log1p(second.color), 1.5, second.jitter)
+    expected = jitter_aligned_upsample(log1p(second.color), (45, 60), second.jitter)
     np.testing.assert_allclose(log1p(image), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_nearness_of_samples():
-    near = jax.jit(lambda jitter: sample_nearness(3, 2, 2, jitter))(jnp.array([0.25, -0.4]))
+    near = jax.jit(lambda jitter: sample_nearness((3, 2), (6, 4), jitter))(jnp.array([0.25, -0.4]))
     assert near.shape == (6, 4, 1)
     # Samples at x 1.5, 3.5 (output pixels: 0.5 + 0.25 times 2), y 0.2, 2.2, 4.2; output centres at 0.5, 1.5 ...
     x, y = np.array([-1.0, 0.0, -1.0, 0.0]), np.array([0.3, -0.7, 0.3, -0.7, 0.3, 1.3])
@@ -368,7 +368,7 @@ def test_frame_without_colour():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(ValueError, match="scale: expected a positive number, got 0"):
+    with pytest.raises(ValueError, match="scale: expected a number >= 1 or the output's .width, height., got 0"):
         fasset(scale=0)
     with pytest.raises(ValueError, match="FASSET's width: expected at least 4 .*, got 3"):
         fasset(width=3)

@@ -17,6 +17,7 @@ from essjax.warp import zero_upsample
 from tests.helpers import make_frames, random_image
 
 T, B, H, W = 3, 2, 9, 14
+LARGE = 2 * H, 2 * W
 FAST = {"xla_backend_optimization_level": 0}
 
 
@@ -29,7 +30,7 @@ def test_enlarged_frames_read_buffers_where_their_samples_lie():
     motion = jnp.asarray(np.concatenate([ramps, -2 * ramps], axis=-1), jnp.float32)
     frame = dataclasses.replace(frame, gbuffers=gbuffers, motion=motion)
     color = random_image(1, B, 2 * H, 2 * W, 3)
-    large = jax.jit(lambda f, c: enlarge(f, 2, c))(frame, color)
+    large = jax.jit(lambda f, c: enlarge(f, LARGE, c))(frame, color)
     wide, high = np.meshgrid((np.arange(2 * W) + 0.5) / 2, (np.arange(2 * H) + 0.5) / 2)
     inside = slice(3, -3)
     expected = np.broadcast_to((0.02 * wide + 0.03 * high)[inside, inside, None], (B, 2 * H - 6, 2 * W - 6, 1))
@@ -44,7 +45,7 @@ def test_enlarged_frames_read_buffers_where_their_samples_lie():
             np.testing.assert_array_equal(up, low[row][:, column])
     np.testing.assert_array_equal(large.color, color)
     assert float(jnp.abs(large.jitter).max()) == 0 and large.gbuffers.world_position is None and large.camera is None
-    assert enlarge(frame, 2, None).color is None
+    assert enlarge(frame, LARGE, None).color is None
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,7 @@ def test_extranet_warps_what_nsrr_made(halved):
 
     image, warped = jax.jit(run, compiler_options=FAST)(everything, frame)
     assert image.shape == (B, 2 * H, 2 * W, 3) and float(image.std()) > 0.1
-    expected = log1p(demodulate(image, albedo(enlarge(frame, 2, None).gbuffers)))
+    expected = log1p(demodulate(image, albedo(enlarge(frame, LARGE, None).gbuffers)))
     np.testing.assert_allclose(warped[..., :3], expected, rtol=1e-4, atol=1e-4)
 
 
@@ -132,14 +133,14 @@ def test_extranet_plus_sees_samples_and_holes_between_them():
     shapes = jax.eval_shape(method.init, jax.random.key(0), first)["extranet_plus"]
     seen = inputs(first, second)
     shading = demodulate(first.color, albedo(gbuffers))
-    sparse, known = (np.asarray(zero_upsample(x, 2, first.jitter)) for x in (shading, jnp.ones((B, H, W, 1))))
+    sparse, known = (np.asarray(zero_upsample(x, LARGE, first.jitter)) for x in (shading, jnp.ones((B, H, W, 1))))
     assert known.mean() == 0.25
     y, x = np.mgrid[4 : 2 * H - 4, 4 : 2 * W - 4]
     at = (slice(None), y - 4, x + 2)
     here = (slice(None), y, x)
     np.testing.assert_allclose(np.asarray(seen.warped)[here][..., :3], np.log1p(sparse[at]), rtol=1e-5, atol=1e-6)
-    there = np.asarray(enlarge(first, 2, None).gbuffers.depth)
-    second_there = np.asarray(enlarge(second, 2, None).gbuffers.depth)
+    there = np.asarray(enlarge(first, LARGE, None).gbuffers.depth)
+    second_there = np.asarray(enlarge(second, LARGE, None).gbuffers.depth)
     same = there[:, y - 4, x + 2] == second_there[:, y, x]
     np.testing.assert_array_equal(np.asarray(seen.mask)[here], known[at] * same)
     assert 0.02 < np.mean(~same) < 0.5

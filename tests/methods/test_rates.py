@@ -59,11 +59,11 @@ def test_ages_count_from_each_rendered_frame():
 
 def test_what_the_network_is_told_is_zero_in_the_papers_setting():
     frame = select_time(frames(), 0)
-    np.testing.assert_array_equal(conditions_of(frame, None, 2), [[0, 0, 0, 0]])
-    np.testing.assert_array_equal(conditions_of(frame, jnp.array([1.0]), 2), [[0, 0, 0, 0]])
+    np.testing.assert_array_equal(conditions_of(frame, None, (2 * H, 2 * W)), [[0, 0, 0, 0]])
+    np.testing.assert_array_equal(conditions_of(frame, jnp.array([1.0]), (2 * H, 2 * W)), [[0, 0, 0, 0]])
     poor = without_buffers(frame, ["base_color"])
-    np.testing.assert_allclose(conditions_of(poor, jnp.array([3.0]), 4), [[1, 0, 1, 1]])
-    np.testing.assert_allclose(conditions_of(without_buffers(frame, ["normal"]), None, 2), [[0, 1, 0, 0]])
+    np.testing.assert_allclose(conditions_of(poor, jnp.array([3.0]), (4 * H, 4 * W)), [[1, 0, 1, 1]])
+    np.testing.assert_allclose(conditions_of(without_buffers(frame, ["normal"]), None, (2 * H, 2 * W)), [[0, 1, 0, 0]])
 
 
 @pytest.mark.parametrize("make", [methods.extrass, methods.extrass_e, methods.extrass_w])

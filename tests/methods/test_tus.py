@@ -49,7 +49,9 @@ def run(method, frames):
 def accumulated(scale, rate_of):
     """Frame after frame, pixel by pixel: the JAU of frame 0, then samples; ``rate_of(number of samples)``."""
     encoded, frames = still(scale)
-    image = np.array(jitter_aligned_upsample(jnp.asarray(encoded[0]), scale, frames.jitter[0]), np.float64)
+    image = np.array(
+        jitter_aligned_upsample(jnp.asarray(encoded[0]), (scale * H, scale * W), frames.jitter[0]), np.float64
+    )
     seen = np.zeros(image.shape[:2])
     for n, jitter in enumerate(np.asarray(frames.jitter)):
         for y in range(H):
@@ -90,7 +92,7 @@ def tus_frames():
 
 def test_tus_is_started_and_padded_with_the_aligned_frame(tus_frames):
     frames, image = tus_frames
-    aligned = jitter_aligned_upsample(reinhard(frames.color), 2, frames.jitter)
+    aligned = jitter_aligned_upsample(reinhard(frames.color), (2 * H, 2 * W), frames.jitter)
     np.testing.assert_allclose(image[0], aligned[0], atol=1e-5)
     np.testing.assert_allclose(image[1:, :, :, :3], aligned[1:, :, :, :3], atol=1e-5)
     np.testing.assert_allclose(image[2, 0], aligned[2, 0], atol=1e-5)
@@ -100,7 +102,9 @@ def test_tus_is_started_and_padded_with_the_aligned_frame(tus_frames):
 def test_tus_is_equation_39_with_a_constant_alpha(tus_frames):
     frames, image = tus_frames
     color = reinhard(frames.color[1])
-    current = jax.jit(lambda color: gaussian_resample(color, color, frames.jitter[1], jnp.float32(0.65), 2))(color)
+    current = jax.jit(
+        lambda color: gaussian_resample(color, color, frames.jitter[1], jnp.float32(0.65), (2 * H, 2 * W))
+    )(color)
     rate = 0.5 * current.weight
     expected = rate * current.color + (1 - rate) * jnp.clip(image[0], current.low, current.high)
     np.testing.assert_allclose(image[1, :, :, 6:], expected[:, :, 6:], atol=1e-4)  # there nothing moves

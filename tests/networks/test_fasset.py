@@ -35,7 +35,7 @@ def inputs(B, H, W, width, scale=1.5):
 
 @functools.cache
 def variables(**settings):
-    given = inputs(1, 8, 8, 24, settings.get("scale", 2))
+    given = inputs(1, 8, 8, 24, settings.pop("scale", 2))
     return jax.eval_shape(fasset(**settings).init, jax.random.key(0), *given)
 
 
@@ -94,7 +94,7 @@ def test_feature_weights_start_in_the_middle_of_their_range():
 
 @pytest.fixture(scope="module")
 def tiny():
-    network = fasset(scale=1.5, width=4, hidden=5, shared=False)
+    network = fasset(width=4, hidden=5, shared=False)
     variables = network.init(jax.random.key(0), *inputs(2, 9, 14, 4))
     run = {m: jax.jit(lambda v, *x, m=m: network.apply(v, *x, method=m)[0]) for m in ("render", "extrapolate")}
     return run, variables
@@ -119,7 +119,7 @@ def test_every_input_and_every_task_has_its_say(tiny):
 
 
 def test_statistics_are_the_batchs_in_training():
-    network, given = fasset(scale=1.5, width=4, hidden=5), inputs(2, 9, 14, 4)
+    network, given = fasset(width=4, hidden=5), inputs(2, 9, 14, 4)
     variables = jax.tree.map(jnp.ones_like, jax.eval_shape(network.init, jax.random.key(0), *given))
     apply = lambda v, *x: network.apply(v, *x, train=True, method="extrapolate")[1]  # noqa: E731
     state = jax.jit(apply)(variables, *given)["batch_stats"]
@@ -137,8 +137,8 @@ ALIGNED = [
 
 
 @functools.cache
-def outputs_at(scale):
-    network = fasset(scale=scale, width=4, hidden=5)
+def outputs():
+    network = fasset(width=4, hidden=5)
     return jax.jit(lambda variables, *x: network.apply(variables, *x, method="render")[0][0])
 
 
@@ -151,12 +151,12 @@ def test_latents_are_read_where_the_samples_lie(tiny, scale, jitter, first, step
     first_layer = variables["params"]["frame_encoder"]["GatedConv_0"]["Conv_0"]
     # The encoder is told the jitter, which differs here between what is compared.
     first_layer["kernel"] = first_layer["kernel"].at[:, :, -2:].set(0.0)
-    *given, local, _ = inputs(2, 13, 18, 4)
+    *given, local, _ = inputs(2, 20, 30, 4)  # of which each scale makes a whole number
 
     def run(scale, jitter, kernel):
         variables["params"]["inr"]["pixel_size"]["kernel"] = kernel
-        known = jnp.broadcast_to(local[:, :1, :1], (2, round(scale * 13), round(scale * 18), LOCAL))
-        return np.asarray(outputs_at(scale)(variables, *given, known, jnp.full((2, 2), jitter))) / OUTPUT_GAIN
+        known = jnp.broadcast_to(local[:, :1, :1], (2, round(scale * 20), round(scale * 30), LOCAL))
+        return np.asarray(outputs()(variables, *given, known, jnp.full((2, 2), jitter))) / OUTPUT_GAIN
 
     low = run(1, 0.0, pixel_size / scale)[:, low_first::low_step, low_first::low_step]
     high = run(scale, jitter, pixel_size)[:, first::step, first::step]

@@ -135,7 +135,7 @@ def test_matching_of_equal_frames_finds_no_motion():
 
 
 def test_extrassnet_on_odd_sizes():
-    network = extrassnet(4, 2)
+    network = extrassnet(4)
     ss, ess = random_image(0, 2, 9, 13, 5), random_image(1, 2, 9, 13, 7)
     conditions = random_image(2, 2, CONDITIONS)
     variables = network.init(jax.random.key(0), ss, ess, conditions)

@@ -9,6 +9,15 @@ from essjax.scenes import render as rendering
 from essjax.scenes.render import color_along, in_tiles, pixel_angle, render_reference, screen_grid
 
 
+def test_images_of_another_shape_show_the_same_to_the_border():
+    """1366x768 and 1920x1080, a 32nd: the edges of the outer pixels are at the same screen positions."""
+    edges = []
+    for width, height, tall in ((43, 24, 1.0), (60, 34, 24 * 60 / (43 * 34))):
+        x, y = (axis.reshape(height, width) for axis in screen_grid(width, height, np.zeros(2), tall=tall))
+        edges.append([x[0, -1] + 0.5 * (x[0, 1] - x[0, 0]), y[-1, 0] + 0.5 * (y[1, 0] - y[0, 0])])
+    np.testing.assert_allclose(edges[0], edges[1], rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("backend", "rays", "calls"),
     [

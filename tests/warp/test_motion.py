@@ -1,5 +1,7 @@
 """Jitter difference, composition, upsampling and dilation of motion."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +26,13 @@ seeds = st.integers(0, 2**31 - 1)
 compose = jax.jit(compose_motion)
 dilate = jax.jit(dilate_motion, static_argnames="radius")
 read = jax.jit(sample, static_argnames="mode")
-upsample = jax.jit(upsample_motion, static_argnums=1, static_argnames="mode")
+
+
+@functools.partial(jax.jit, static_argnums=1, static_argnames="mode")
+def upsample(motion, scale, jitter=None, mode="bilinear"):
+    return upsample_motion(
+        motion, (round(scale * motion.shape[-3]), round(scale * motion.shape[-2])), jitter=jitter, mode=mode
+    )
 
 
 def affine(positions, a, b):
@@ -103,7 +111,8 @@ def test_upsampled_motion_is_the_same_world_motion(scale):
     low = world(np.asarray(pixel_positions(H, W)) + jitter).astype(np.float32)
     high = upsample(low, scale, jitter=jitter)
     height, width = round(H * scale), round(W * scale)
-    expected = scale * world(np.asarray(pixel_positions(height, width)) / scale)
+    ratio = np.float32([width / W, height / H])  # 14 / 9 high, 18 / 12 wide: each axis has its own
+    expected = ratio * world(np.asarray(pixel_positions(height, width)) / ratio)
     assert high.shape == (height, width, 2)
     np.testing.assert_allclose(high[4:-4, 4:-4], expected[4:-4, 4:-4], atol=1e-4)
 

@@ -17,12 +17,12 @@ H, W = 3, 4
 
 @functools.partial(jax.jit, static_argnums=3)
 def gaussian(color, jitter, sigma, scale):
-    return gaussian_resample(color, color, jitter, sigma, scale)
+    return gaussian_resample(color, color, jitter, sigma, (H * scale, W * scale))
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def tent(color, jitter, scale):
-    return tent_resample(color, color, jitter, scale)
+    return tent_resample(color, color, jitter, (H * scale, W * scale))
 
 
 def nine(row, column):
@@ -88,7 +88,9 @@ def test_leading_axes_broadcast():
 def test_float32_under_x64():
     color, jitter = np.ones((H, W, 2), np.float32), np.zeros(2, np.float32)
     with jax.enable_x64(True):
-        got = gaussian_resample(jnp.asarray(color), jnp.asarray(color), jnp.asarray(jitter), jnp.float32(0.6), 2)
+        got = gaussian_resample(
+            jnp.asarray(color), jnp.asarray(color), jnp.asarray(jitter), jnp.float32(0.6), (2 * H, 2 * W)
+        )
         assert {leaf.dtype for leaf in got} == {jnp.dtype("float32")}
 
 
@@ -96,8 +98,8 @@ def test_float32_under_x64():
 def test_errors_name_the_argument(resample):
     image, jitter = jnp.zeros((H, W, 3)), jnp.zeros(2)
     with pytest.raises(ValueError, match=r"bounded: expected \[..., 3, 4, C\], got \(6, 6, 3\)"):
-        resample(image, jnp.zeros((6, 6, 3)), jitter, 2)
-    with pytest.raises(ValueError, match="scale: expected a whole number >= 1, got 1.5"):
-        resample(image, image, jitter, 1.5)
+        resample(image, jnp.zeros((6, 6, 3)), jitter, (6, 8))
+    with pytest.raises(ValueError, match=r"size: expected .height, width., two whole numbers >= 1, got 2"):
+        resample(image, image, jitter, 2)
     with pytest.raises(ValueError, match=r"color: expected \[..., H, W, C\], got \(3, 4\)"):
-        resample(image[..., 0], image, jitter, 2)
+        resample(image[..., 0], image, jitter, (6, 8))

@@ -1,5 +1,7 @@
 """Zero upsampling, jitter-aligned upsampling, sample distances, blocks to channels."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,12 +22,26 @@ from essjax.warp import (
 )
 
 H, W = 5, 8
+LARGE = 2 * H, 2 * W
 FEW = settings(max_examples=15, deadline=None)
 in_pixel = st.floats(-0.5, 0.49)
-zeros = jax.jit(zero_upsample, static_argnums=1)
 fold = jax.jit(space_to_depth, static_argnums=1)
 unfold = jax.jit(depth_to_space, static_argnums=1)
-jau = jax.jit(jitter_aligned_upsample, static_argnums=1, static_argnames="mode")
+
+
+def times(scale, image):
+    """(height, width) of an output ``scale`` times as large."""
+    return scale * np.shape(image)[-3], scale * np.shape(image)[-2]
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def zeros(image, scale, jitter):
+    return zero_upsample(image, times(scale, image), jitter)
+
+
+@functools.partial(jax.jit, static_argnums=1, static_argnames="mode")
+def jau(image, scale, jitter, mode="bilinear"):
+    return jitter_aligned_upsample(image, times(scale, image), jitter, mode=mode)
 
 
 def image_of(seed, *leading):
@@ -69,10 +85,10 @@ def test_reading_a_zero_upsampled_image_without_making_it(scale):
     positions[:, :3] = np.floor(positions[:, :3]) + 0.5
 
     def direct(image):
-        return sample_zero_upsampled(image, positions, scale, jitter)
+        return sample_zero_upsampled(image, positions, times(scale, image), jitter)
 
     def through_the_large_image(image):
-        return sample(zero_upsample(image, scale, jitter), positions, outside="zeros")
+        return sample(zero_upsample(image, times(scale, image), jitter), positions, outside="zeros")
 
     weights = rng.normal(size=(2, 9, 30, 3)).astype(np.float32)
     results = []
@@ -128,7 +144,7 @@ def test_space_to_depth_and_back(block, leading):
 
 
 def test_gradients_are_finite_and_complete():
-    loss = lambda i, j: jnp.sum(jitter_aligned_upsample(i, 2, j, mode="bicubic"))
+    loss = lambda i, j: jnp.sum(jitter_aligned_upsample(i, times(2, i), j, mode="bicubic"))
     to_image, to_jitter = jax.jit(jax.grad(loss, (0, 1)))(image_of(4), jnp.zeros(2))
     assert np.isfinite(to_image).all() and np.isfinite(to_jitter).all()
     assert float(to_image.sum()) == pytest.approx(4 * H * W * 3, rel=1e-5)
@@ -137,18 +153,20 @@ def test_gradients_are_finite_and_complete():
 def test_nearest_keeps_integers_and_interpolated_integers_are_float32():
     """16777217 = 2^24 + 1 is the first integer that float32 lacks."""
     ids = np.full((H, W, 1), 2**24 + 1, np.int32)
-    got = jitter_aligned_upsample(ids, 2, (0.1, -0.2), mode="nearest")
+    got = jitter_aligned_upsample(ids, times(2, ids), (0.1, -0.2), mode="nearest")
     assert got.dtype == jnp.int32 and (np.asarray(got) == 2**24 + 1).all()
-    mixed = jitter_aligned_upsample(np.arange(W, dtype=np.uint8)[None, :, None].repeat(H, 0), 2, (0.0, 0.0))
+    mixed = jitter_aligned_upsample(np.arange(W, dtype=np.uint8)[None, :, None].repeat(H, 0), LARGE, (0.0, 0.0))
     assert mixed.dtype == jnp.float32
     np.testing.assert_allclose(mixed[0, 1:5, 0], [0.25, 0.75, 1.25, 1.75])
 
 
 TAKE_JITTER = {
-    "zero_upsample": lambda jitter: zero_upsample(image_of(0), 2, jitter),
-    "sample_zero_upsampled": lambda jitter: sample_zero_upsampled(image_of(0), jnp.ones((2, 2, 2)), 2, jitter),
-    "jitter_aligned_upsample": lambda jitter: jitter_aligned_upsample(image_of(0), 2, jitter),
-    "gaussian_resample": lambda jitter: gaussian_resample(image_of(0), image_of(0), jitter, jnp.float32(0.5), 2).color,
+    "zero_upsample": lambda jitter: zero_upsample(image_of(0), LARGE, jitter),
+    "sample_zero_upsampled": lambda jitter: sample_zero_upsampled(image_of(0), jnp.ones((2, 2, 2)), LARGE, jitter),
+    "jitter_aligned_upsample": lambda jitter: jitter_aligned_upsample(image_of(0), LARGE, jitter),
+    "gaussian_resample": lambda jitter: (
+        gaussian_resample(image_of(0), image_of(0), jitter, jnp.float32(0.5), LARGE).color
+    ),
     "jittered_motion": lambda jitter: jittered_motion(jnp.zeros((H, W, 2)), jitter, jitter),
 }
 
@@ -168,9 +186,9 @@ def test_errors_name_the_argument():
         space_to_depth(image, 2)
     with pytest.raises(ValueError, match="depth_to_space: expected a multiple of 4 channels, got 3"):
         depth_to_space(image, 2)
-    with pytest.raises(ValueError, match="scale: expected a whole number >= 1, got 1.5"):
-        zero_upsample(image, 1.5, jnp.zeros(2))
-    with pytest.raises(ValueError, match="scale: expected a positive number, got 0"):
-        jitter_aligned_upsample(image, 0, jnp.zeros(2))
+    with pytest.raises(ValueError, match="size: expected at least the image's 8x5, got 8x4"):
+        zero_upsample(image, (4, 8), jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"size: expected .height, width., two whole numbers >= 1, got .0, 8."):
+        jitter_aligned_upsample(image, (0, 8), jnp.zeros(2))
     with pytest.raises(ValueError, match="mode: expected one of nearest"):
-        jitter_aligned_upsample(image, 2, jnp.zeros(2), mode="lanczos")
+        jitter_aligned_upsample(image, LARGE, jnp.zeros(2), mode="lanczos")

@@ -73,7 +73,20 @@ def write_atomically(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
-def open_meta(path: Path, size: tuple[int, int], scale: int, source: dict) -> dict:
+def ratio(text: str) -> float:
+    """Parse a number of at least 1, as an argument's type."""
+    value = float(text)
+    if not 1 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number of at least 1, got {text}")
+    return value
+
+
+def enlarged(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Width and height of the reference."""
+    return round(scale * size[0]), round(scale * size[1])
+
+
+def open_meta(path: Path, size: tuple[int, int], scale: float, source: dict) -> dict:
     """Read meta.json: that of an unfinished clip, or a new one without frames.
 
     Args:
@@ -87,7 +100,7 @@ def open_meta(path: Path, size: tuple[int, int], scale: int, source: dict) -> di
     """
     meta = {
         "render_size": list(size),
-        "display_size": [scale * size[0], scale * size[1]],
+        "display_size": list(enlarged(size, scale)),
         "jitter_unit": JITTER_UNIT,
         "source": source,
     }

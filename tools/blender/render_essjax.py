@@ -36,7 +36,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--scene", type=Path, help=".blend, .glb or .gltf; without it the file that Blender has open")
     parser.add_argument("--demo", action="store_true", help="render a built-in scene instead")
     parser.add_argument("--size", default="480x270", help="WIDTHxHEIGHT of the LR images")
-    parser.add_argument("--scale", type=clip.positive, default=2, help="size of the reference / LR size")
+    parser.add_argument("--scale", type=clip.ratio, default=2, help="size of the reference / LR size")
     parser.add_argument("--frames", help="FIRST:LAST, both included; without it the scene's")
     parser.add_argument("--camera", help="name of the camera; without it the scene's")
     parser.add_argument(
@@ -193,7 +193,7 @@ def render_frame(folder: Path, frame: int, camera, layer, args: argparse.Namespa
     camera.data.shift_x, camera.data.shift_y = clip.camera_shift(jitter, *size, camera.data.sensor_fit)
     render_to(lr, scene, layer, size=size, samples=args.lr_samples, guides=True)
     camera.data.shift_x = camera.data.shift_y = 0.0
-    large = (args.scale * size[0], args.scale * size[1])
+    large = clip.enlarged(size, args.scale)
     render_to(hr, scene, layer, size=large, samples=args.hr_samples, guides=False)
     return describe(camera, size, jitter)
 

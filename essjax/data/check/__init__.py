@@ -19,6 +19,7 @@ from essjax.data.check.pictures import write_pictures
 from essjax.data.check.surfaces import SurfaceCheck, judge_surfaces, proved
 from essjax.data.check.values import ValuesCheck, judge_values
 from essjax.data.layout import Dataset, SequenceInfo
+from essjax.sizes import ratios
 
 __all__ = ["VERDICTS", "CheckReport", "Finding", "check_dataset"]
 
@@ -87,7 +88,7 @@ def _is_srgb(info: SequenceInfo) -> bool:
 def _judge(checks: Sequence[_Checks], info: SequenceInfo) -> list[Finding]:
     jitter = [check.jitter for check in checks]
     own = info.source.get("reference") == "color"
-    against, shift = judge_against(jitter, info.scale, own_reference=own)
+    against, shift = judge_against(jitter, ratios(info.size, info.output), own_reference=own)
     references_jittered = own or against.fix == FIXES["none"]
     surfaces = [check.surfaces for check in checks]
     motion = judge_motion(

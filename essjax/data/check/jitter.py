@@ -15,6 +15,7 @@ from essjax.data.check.finding import Finding, some
 from essjax.data.check.motion import Look, rendered_errors, tone
 from essjax.data.check.pairs import Step
 from essjax.data.check.readings import jitter_step
+from essjax.sizes import ratios
 from essjax.typing import Array, Color
 from essjax.warp import inside_mask
 from essjax.warp.sampling import axis_taps
@@ -88,24 +89,26 @@ def _read(image: Array, positions: Array, axis: int) -> Array:
     return sum((jnp.take(image, t.index, axis=axis) * t.weight.reshape(shape) for t in taps), jnp.zeros(()))
 
 
-@partial(jax.jit, static_argnames="scale")
-def _grid_errors(pixels: Color, reference: Color, rows: Array, columns: Array, key: Array, *, scale: int) -> Array:
+@partial(jax.jit, static_argnames="ratio")
+def _grid_errors(
+    pixels: Color, reference: Color, rows: Array, columns: Array, key: Array, *, ratio: tuple[float, float]
+) -> Array:
     """Mean absolute error ``[dy, dx]`` of LR ``pixels [h, w, 3]`` against the reference at their place + ``SHIFTS``.
 
     Args:
       pixels: of the frame, at ``rows`` and ``columns``.
-      reference: ``[sH, sW, 3]``.
-      rows: ``[h]`` y of the pixel centres, LR pixels.
+      reference: ``[H', W', 3]``.
+      rows: ``[h]`` y of the pixel centres.
       columns: ``[w]`` x of the pixel centres.
       key: see ``tone``.
-      scale: reference size over frame size.
+      ratio: reference size over frame size, along x and y.
     """
     toned, reference = tone(pixels, key), tone(reference, key)
-    shifts = jnp.asarray(SHIFTS, jnp.float32)
+    shifts, (along_x, along_y) = jnp.asarray(SHIFTS, jnp.float32), ratio
 
     def of_column(dx: Array) -> Array:
-        wide = _read(reference, (columns + dx) * scale, 1)
-        error = lambda dy: jnp.abs(_read(wide, (rows + dy) * scale, 0) - toned).mean()
+        wide = _read(reference, (columns + dx) * along_x, 1)
+        error = lambda dy: jnp.abs(_read(wide, (rows + dy) * along_y, 0) - toned).mean()
         return jax.lax.map(error, shifts)
 
     return jax.lax.map(of_column, shifts).T
@@ -118,7 +121,8 @@ def reference_errors(step: Step) -> np.ndarray:
     rows, columns = (np.arange(_BORDER, n - _BORDER, stride) for n in (height, width))
     pixels = np.asarray(step.now.color)[rows][:, columns]
     centres = (rows + np.float32(0.5), columns + np.float32(0.5))
-    return np.asarray(_grid_errors(pixels, step.reference, *centres, step.key, scale=step.scale), np.float64)
+    ratio = ratios(step.size, step.output)
+    return np.asarray(_grid_errors(pixels, step.reference, *centres, step.key, ratio=ratio), np.float64)
 
 
 @dataclasses.dataclass
@@ -224,7 +228,7 @@ def _around(surface: np.ndarray, jitter: np.ndarray) -> np.ndarray:
     return map_coordinates(surface, [rows + jitter[1] / SHIFT_STEP, columns + jitter[0] / SHIFT_STEP], mode="nearest")
 
 
-def _judge_shift(checks: Sequence[JitterCheck], scale: int) -> Finding:
+def _judge_shift(checks: Sequence[JitterCheck], ratio: tuple[float, float]) -> Finding:
     check = ROWS[2]
     stated = [jitter for c in checks for jitter in c.stated]
     if not stated:
@@ -237,8 +241,9 @@ def _judge_shift(checks: Sequence[JitterCheck], scale: int) -> Finding:
     if size < SHIFT_OK:
         return Finding(check, "ok", where, "", numbers)
     fix = (
-        f"add ({x:+.2f}, {y:+.2f}) to the jitter, or move the reference by ({-scale * x:+.1f}, {-scale * y:+.1f}) of "
-        "its pixels: is jitter in [0, 1), or the reference resized with aligned corners, cropped or jittered?"
+        f"add ({x:+.2f}, {y:+.2f}) to the jitter, or move the reference by "
+        f"({-ratio[0] * x:+.1f}, {-ratio[1] * y:+.1f}) of its pixels: is jitter in [0, 1), or the "
+        "reference resized with aligned corners, cropped or jittered?"
     )
     return Finding(check, "wrong" if size >= SHIFT_WRONG else "warning", where, fix, numbers)
 
@@ -247,12 +252,14 @@ def _jittered(checks: Sequence[JitterCheck]) -> bool:
     return max(np.abs(jitter).max() for check in checks for jitter in check.jitters) > NOTHING
 
 
-def judge_against(checks: Sequence[JitterCheck], scale: int, *, own_reference: bool = False) -> tuple[Finding, Finding]:
+def judge_against(
+    checks: Sequence[JitterCheck], ratio: tuple[float, float], *, own_reference: bool = False
+) -> tuple[Finding, Finding]:
     """Judge jitter and a constant shift, frames against references.
 
     Args:
       checks: one per sequence.
-      scale: reference size over frame size.
+      ratio: reference size over frame size, along x and y.
       own_reference: the references are the frames themselves, so only the jitter's range can be judged.
     """
     if own_reference:
@@ -262,7 +269,7 @@ def judge_against(checks: Sequence[JitterCheck], scale: int, *, own_reference: b
     if against.verdict == "wrong":
         fix = "put the jitter right, then check again"
         return against, Finding(ROWS[2], "not decidable", "the jitter is wrong", fix)
-    return against, _judge_shift(checks, scale)
+    return against, _judge_shift(checks, ratio)
 
 
 def judge_between(checks: Sequence[JitterCheck], *, motion_wrong: bool, against: Finding) -> Finding:

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ from essjax.data.check.pairs import Step
 from essjax.data.check.readings import JITTERED, NONE, READINGS, fix_of, jitter_step, motions_of
 from essjax.data.check.surfaces import guide_errors, interior, lands_inside, regions_of
 from essjax.data.layout import SequenceInfo
+from essjax.sizes import Size, whole_ratio
 from essjax.typing import Array, Color, Image, Jitter, Motion
 from essjax.warp import backward_warp, hole_mask, inside_mask, upsample_motion
 
@@ -44,19 +44,28 @@ def tone(image: Array, key: Array | float) -> Array:
     return image / (image + key)
 
 
-def _blocks(image: Array, scale: int) -> Array:
-    """Means over blocks of ``scale``^2 pixels: ``[sH, sW]`` to ``[H, W]``."""
-    height, width = image.shape
-    return image.reshape(height // scale, scale, width // scale, scale).mean(axis=(1, 3))
+def _blocks(image: Array, size: Size) -> Array:
+    """Means over the pixels whose centres lie in each pixel of a grid of ``size``: ``[H', W']`` to ``size``."""
+    factor = whole_ratio(size, image.shape)
+    if factor is not None:
+        return image.reshape(size[0], factor, size[1], factor).mean(axis=(1, 3))
+    rows, columns = (_shares(n, large) for n, large in zip(size, image.shape, strict=True))
+    return rows @ image @ columns.T
 
 
-@partial(jax.jit, static_argnames="scale")
-def warp_errors(previous: Color, current: Color, motion: Motion, jitter: Jitter, key: Array, *, scale: int) -> Image:
+def _shares(size: int, large: int) -> np.ndarray:
+    """Share of each of ``large`` pixels in each of ``size`` that are as long together, ``[size, large]``."""
+    inside = np.floor((np.arange(large) + 0.5) * size / large) == np.arange(size)[:, None]
+    return np.asarray(inside / inside.sum(axis=1, keepdims=True), np.float32)
+
+
+@jax.jit
+def warp_errors(previous: Color, current: Color, motion: Motion, jitter: Jitter, key: Array) -> Image:
     """``[H, W, 3]``: absolute error, squared error and luminance of ``previous`` warped by LR ``motion``, toned."""
-    warped = tone(backward_warp(previous, upsample_motion(motion, scale, jitter=jitter)), key)
+    warped = tone(backward_warp(previous, upsample_motion(motion, previous.shape[:2], jitter=jitter)), key)
     difference = warped - tone(current, key)
     planes = (jnp.abs(difference), difference**2, warped)
-    return jnp.stack([_blocks(plane.mean(axis=-1), scale) for plane in planes], axis=-1)
+    return jnp.stack([_blocks(plane.mean(axis=-1), motion.shape[:2]) for plane in planes], axis=-1)
 
 
 @jax.jit
@@ -91,11 +100,9 @@ def look(step: Step) -> Look:
     usable = np.zeros((len(READINGS), height, width), bool)
     for index in np.flatnonzero(known):
         motion = motions[index]
-        planes[index] = warp_errors(
-            step.reference_before, step.reference, motion, step.now.jitter, step.key, scale=step.scale
-        )
+        planes[index] = warp_errors(step.reference_before, step.reference, motion, step.now.jitter, step.key)
         usable[index] = np.asarray(_inside(motion)) & step.mask
-    present = _blocks(tone(step.reference, step.key).mean(axis=-1), step.scale)
+    present = _blocks(tone(step.reference, step.key).mean(axis=-1), step.size)
     flat = present.std() < 1e-3
     similarity = max(_correlation(planes[i, ..., 2], np.asarray(present)) for i in np.flatnonzero(known))
     return Look(motions, usable, planes[..., 0], planes[..., 1], 1.0 if flat else similarity)
@@ -142,7 +149,7 @@ def rendered_errors(step: Step, lookup: np.ndarray) -> np.ndarray:
     """Absolute error ``[H, W]`` of the rendered frame before, read at pixel + ``lookup``, toned."""
     assert step.before is not None
     zero = np.zeros(2, np.float32)
-    return np.asarray(warp_errors(step.before.color, step.now.color, lookup, zero, step.key, scale=1))[..., 0]
+    return np.asarray(warp_errors(step.before.color, step.now.color, lookup, zero, step.key))[..., 0]
 
 
 def right_reading(checks: Sequence[MotionCheck], proved: int | None) -> tuple[int | None, str]:

@@ -9,6 +9,7 @@ import numpy as np
 from essjax.data.layout import Dataset, SequenceInfo
 from essjax.data.read import read_sequence
 from essjax.frames import Frame, Sequence, frame_images, select_time
+from essjax.sizes import Size
 
 GOLDEN = 0.5 * (5**0.5 - 1)
 """Multiples of it, modulo 1, fill [0, 1) evenly and have no period."""
@@ -46,14 +47,14 @@ class Step:
     key: float
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """Height and width of the rendered frame."""
         return self.now.motion.shape[0], self.now.motion.shape[1]
 
     @property
-    def scale(self) -> int:
-        """Reference size over frame size."""
-        return self.reference.shape[0] // self.now.motion.shape[0]
+    def output(self) -> Size:
+        """Height and width of the reference."""
+        return self.reference.shape[0], self.reference.shape[1]
 
     @property
     def where(self) -> str:

@@ -22,7 +22,7 @@ def warp_picture(step: Step, reading: str) -> np.ndarray:
     """``[sH, 3 sW + 2 gaps, 3]`` bytes: warped, present, absolute difference times ``GAIN``, as displayed."""
     assert step.reference_before is not None
     motion = motions_of(step)[reading]
-    warped = backward_warp(step.reference_before, upsample_motion(motion, step.scale, jitter=step.now.jitter))
+    warped = backward_warp(step.reference_before, upsample_motion(motion, step.output, jitter=step.now.jitter))
     grey = np.float32(0.18 / step.key)  # whatever the unit of radiance, middle grey looks like middle grey
     shown, present = np.asarray(display(warped * grey)), np.asarray(display(step.reference * grey))
     gap = np.ones((shown.shape[0], 4, 3), np.float32)

@@ -6,6 +6,7 @@ import numpy as np
 from essjax.cameras import pixel_positions, static_motion
 from essjax.data.check.pairs import Step
 from essjax.data.layout import SequenceInfo
+from essjax.sizes import ratios
 from essjax.typing import Array, Jitter, Motion
 
 FIXES = {
@@ -70,7 +71,8 @@ def jitter_step(step: Step) -> np.ndarray:
 def motions_of(step: Step) -> dict[str, np.ndarray]:
     """Every reading's motion ``[H, W, 2]``; NaN where the dataset lacks what it takes."""
     motion, jitter = np.asarray(step.now.motion, np.float32), jitter_step(step)
-    (height, width), scale = step.size, step.scale
+    (height, width), (along_x, along_y) = step.size, ratios(step.size, step.output)
+    odd = {along_x, along_y}.isdisjoint({1, 2})  # else it is another reading
     swapped = motion[..., ::-1]
     times = lambda image, x, y: image * np.array([x, y], np.float32)
     cameras = camera_motion(step)
@@ -83,8 +85,8 @@ def motions_of(step: Step) -> dict[str, np.ndarray]:
         "swapped": swapped, "swapped, x flipped": times(swapped, -1, 1),
         "swapped, y flipped": times(swapped, 1, -1), "swapped, both flipped": -swapped,
         "times 2": motion * 2, "times 1/2": motion / 2,
-        "times scale": missing if scale in (1, 2) else motion * scale,
-        "times 1/scale": missing if scale in (1, 2) else motion / scale,
+        "times scale": times(motion, along_x, along_y) if odd else missing,
+        "times 1/scale": times(motion, 1 / along_x, 1 / along_y) if odd else missing,
         "times size (UV)": times(motion, width, height),
         "times half size (NDC)": times(motion, width / 2, -height / 2),
         "plus jitter": motion + jitter, "minus jitter": motion - jitter,
@@ -98,4 +100,6 @@ def motions_of(step: Step) -> dict[str, np.ndarray]:
 
 def fix_of(reading: str, info: SequenceInfo) -> str:
     """Say what to do if ``reading`` is the right one."""
-    return FIXES[reading].format(width=info.width, height=info.height, scale=info.scale)
+    along_x, along_y = ratios(info.size, info.output)
+    scale = f"{along_x:.4g}" if along_x == along_y else f"{along_x:.4g} (x) and {along_y:.4g} (y)"
+    return FIXES[reading].format(width=info.width, height=info.height, scale=scale)

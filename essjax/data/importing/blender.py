@@ -22,6 +22,7 @@ from essjax.data.importing.motion import camera_motion
 from essjax.data.importing.stream import Converted
 from essjax.data.json_files import OBJECT, POSITIVE, Kind, check, numbers, read_json, whole
 from essjax.frames import Frame, GBuffers
+from essjax.sizes import Size, scale_of
 
 BLENDER_BACKGROUND = 1e9
 """Blender writes 1e10 as the depth of the background."""
@@ -42,7 +43,7 @@ class _Dump:
     folder: Path
     width: int
     height: int
-    scale: int
+    output: Size
     cameras: dict[int, Camera]
     jitters: dict[int, np.ndarray]
 
@@ -81,12 +82,11 @@ def _read_meta(folder: Path) -> _Dump:
     jitters = {number: np.asarray(record["jitter"], np.float32) for number, record in frames.items()}
     if not cameras:
         raise ValueError(f"{path}: expected at least one frame under 'frames', got none.")
-    if (wide, high) != (width * (wide // width), height * (wide // width)):
+    if wide < width or high < height:
         raise ValueError(
-            f"{path}: expected display_size to be a whole multiple of render_size, got {wide}x{high} and "
-            f"{width}x{height}."
+            f"{path}: expected display_size to be at least render_size, got {wide}x{high} and {width}x{height}."
         )
-    return _Dump(folder, width, height, wide // width, cameras, jitters)
+    return _Dump(folder, width, height, (high, wide), cameras, jitters)
 
 
 def _check_files(dump: _Dump) -> None:
@@ -232,7 +232,7 @@ def _convert(dump: _Dump, number: int, dynamic: tuple[int, ...]) -> Converted:
 
     color, negative = _radiance(passes)
     reference, negative_reference = _radiance(
-        _Passes(dump.folder / f"hr.{number:04d}.exr", dump.width * dump.scale, dump.height * dump.scale)
+        _Passes(dump.folder / f"hr.{number:04d}.exr", dump.output[1], dump.output[0])
     )
     gbuffers = GBuffers(
         base_color=np.where(hit, np.clip(passes.get("basecolor", "RGB"), 0.0, 1.0), 0.0).astype(np.float32),
@@ -298,7 +298,7 @@ class BlenderClip:
         """Return what ``meta.json`` says that matters to one frame."""
         dump = self.dump
         camera, previous = dump.cameras[number], dump.cameras.get(number - 1)
-        size = (dump.width, dump.height, dump.scale)
+        size = (dump.width, dump.height, scale_of((dump.height, dump.width), dump.output))
         return repr((size, camera, previous, dump.jitters[number].tolist()))
 
     def convert(self, number: int) -> Converted:

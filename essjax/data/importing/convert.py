@@ -147,19 +147,21 @@ def unit_normals(stored: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def at_samples(image: np.ndarray, width: int, height: int, jitter: np.ndarray) -> np.ndarray:
-    """Read an image of a whole multiple of the frame's size at the pixel that each sample of the frame lies in.
+    """Read an image that is larger than the frame at the pixel that each sample of the frame lies in.
 
     Args:
-      image: ``[s*H, s*W, C]``; averaging would mix surfaces.
+      image: ``[H', W', C]`` of the same view; averaging would mix surfaces.
       width: of the frame.
       height: of the frame.
       jitter: ``[2]`` pixels of the frame: the sample lies at pixel centre + jitter.
     """
-    scale = image.shape[0] // height
-    if scale == 1:
+    if image.shape[:2] == (height, width):
         return image
     x, y = (np.arange(size) + 0.5 + offset for size, offset in zip((width, height), jitter, strict=True))
-    columns, rows = (np.clip((p * scale).astype(int), 0, scale * len(p) - 1) for p in (x, y))
+    columns, rows = (
+        np.clip((p * (large / len(p))).astype(int), 0, large - 1)
+        for p, large in ((x, image.shape[1]), (y, image.shape[0]))
+    )
     return image[rows[:, None], columns[None]]
 
 

@@ -51,7 +51,7 @@ def read_images(
     709 where a header states other primaries. The stencil is float64, which holds every id of 32 bits, as it is stored.
 
     Args:
-      wanted: image -> where it is. The first one says which size the frame has; others have it, or a multiple.
+      wanted: image -> where it is. The first one says which size the frame has; others have it, or a larger one.
       packings: images that are packed into bytes -> D and D' of ``convert.unpack``.
 
     Raises:
@@ -78,10 +78,11 @@ def read_images(
 
 def _check_size(path: Path, channel: str, got: tuple[int, ...], size: tuple[int, ...], own: tuple[int, ...]) -> None:
     (height, width), (high, wide) = size, got
-    if got != own or high % height or wide % width or high // height != wide // width:
+    same_shape = abs(high * width - wide * height) < max(width, height)  # to the pixel: sizes are rounded
+    if got != own or high < height or wide < width or not same_shape:
         raise ValueError(
-            f"{path}, channel {channel}: expected {width}x{height} as the others (or a whole multiple), got "
-            f"{wide}x{high}."
+            f"{path}, channel {channel}: expected {width}x{height} as the others (or larger, with the same ratio of "
+            f"its sides), got {wide}x{high}."
         )
 
 

@@ -8,10 +8,10 @@ from essjax.frames import SampleRanges, Sequence
 from essjax.interfaces import Method
 from essjax.labels import ALIASING, DEFAULTS, GHOSTING, Thresholds, label_sequence
 from essjax.losses import class_weights, cross_entropy, l1, masked_mean, temporal_l1
-from essjax.networks.blocks import nearest_upsample
 from essjax.rollout import SS, every, unroll
 from essjax.train.objectives.common import Objective
 from essjax.typing import Array, PyTree
+from essjax.warp import nearest_upsample
 
 
 def required_ranges(clip: Sequence) -> SampleRanges:
@@ -75,7 +75,7 @@ def composition_objective(method: Method, *, temporal_weight: float = 0.1) -> Ob
         kept = unroll(method, variables, clip.frames, every(), keep=keep).aux[SS]
         image, warped, valid, exposure = (kept[name][1:] for name in names)
         if clip.valid is not None:
-            valid = valid * nearest_upsample(jnp.asarray(clip.valid[1:]), clip.scale)
+            valid = valid * nearest_upsample(jnp.asarray(clip.valid[1:]), clip.size)
         terms = {
             "l1": jnp.mean(l1(image, reinhard(expose(clip.reference[1:], exposure)))),
             "temporal": temporal_weight * masked_mean(temporal_l1(image, warped, valid), valid),

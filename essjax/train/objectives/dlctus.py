@@ -37,7 +37,7 @@ def dlctus_objective(method: Method, *, targets: int = 5, theta: float | None = 
         if theta is None:
             return {"l1": jnp.mean(jnp.abs(error[1:]))}, rollout.state
         frames = select_time(clip.frames, last)
-        motion = upsample_motion(frames.motion, clip.scale, jitter=frames.jitter)
+        motion = upsample_motion(frames.motion, clip.size, jitter=frames.jitter)
         before = jnp.where(expand_flag(frames.cut, error.ndim), 0.0, backward_warp(error[:-1], motion))
         loss = spatio_temporal(error[1:], before, theta=theta)
         return {"spatio_temporal": jnp.mean(loss)}, rollout.state

@@ -25,7 +25,7 @@ def frame_shading(clip: Sequence) -> Color:
 
 def reference_shading(clip: Sequence) -> Color:
     """ExtraNet+'s: the anti-aliased reference, demodulated by upsampled base colour. ``clip`` has no time axis."""
-    return demodulate(clip.reference, albedo(enlarge(clip.frames, clip.scale, None).gbuffers))
+    return demodulate(clip.reference, albedo(enlarge(clip.frames, clip.size, None).gbuffers))
 
 
 def extranet_objective(

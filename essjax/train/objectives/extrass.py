@@ -23,7 +23,6 @@ from essjax.losses import (
     temporal_l1,
 )
 from essjax.methods.extrass_low import halve
-from essjax.networks.blocks import nearest_upsample
 from essjax.train.objectives.common import (
     Objective,
     Phase,
@@ -38,6 +37,7 @@ from essjax.train.objectives.common import (
     whole_periods,
 )
 from essjax.typing import Array, Callable, PyTree
+from essjax.warp import nearest_upsample
 
 
 def frnet_objective(method: Method, *, feature_weight: float = 0.001, period: int = 2) -> Objective:
@@ -125,7 +125,7 @@ def extrass_objective(
         image, before = display_of_log1p(predicted["log_image"]), display_of_log1p(warped.log_image)
         reference = expose(part.reference, predicted["exposure"])
         target = display(reference)
-        valid = warped.valid if part.valid is None else nearest_upsample(part.valid, clip.scale)
+        valid = warped.valid if part.valid is None else nearest_upsample(part.valid, clip.size)
         hole = (1 - valid) * (since > 0)[..., None, None, None]
         counts = jnp.where(since >= phase.distance, weight, 0.0)
         change = temporal_l1(image, before, warped.valid)

@@ -4,7 +4,6 @@ from essjax.color import expose, log1p
 from essjax.frames import Sequence, select_time
 from essjax.interfaces import Method
 from essjax.losses import hardest, l1, masked_mean, occlusion
-from essjax.networks.blocks import nearest_upsample
 from essjax.train.objectives.common import (
     Objective,
     Phase,
@@ -15,6 +14,7 @@ from essjax.train.objectives.common import (
     whole_periods,
 )
 from essjax.typing import Array, PyTree
+from essjax.warp import nearest_upsample
 
 
 def fasset_objective(
@@ -42,7 +42,7 @@ def fasset_objective(
         target = log1p(expose(part.reference, predicted["exposure"]))
         errors = l1(predicted["log_image"], target)
         valid = predicted["valid"] if part.valid is None else part.valid
-        hole = (1.0 - nearest_upsample(valid, clip.scale)) * (age > 0)[..., None, None, None]
+        hole = (1.0 - nearest_upsample(valid, clip.size)) * (age > 0)[..., None, None, None]
         counts = age >= phase.distance
         return {
             "l1": frame_mean(errors, counts),

@@ -50,12 +50,13 @@ class Suite(NamedTuple):
 
 def load() -> dict[str, Suite]:
     """Name -> suite, in the order in which they run."""
-    from experiments.benchmark.suites import networks, pipeline, scenes, train, warp
+    from experiments.benchmark.suites import networks, pipeline, ratios, scenes, train, warp
 
     return {
         "warp": Suite("warps, and the gradients that training needs", warp.rows),
         "networks": Suite("forward passes of the networks", networks.rows),
         "pipeline": Suite("streaming: SS and ESS frames of whole methods", pipeline.rows, pipeline.facts),
+        "ratios": Suite("streaming: one output size from inputs of several", ratios.rows),
         "train": Suite("train steps with backpropagation through time", train.rows, train.facts),
         "scenes": Suite("the built-in renderer", scenes.rows),
     }

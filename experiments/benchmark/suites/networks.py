@@ -75,7 +75,7 @@ def forwards(width: int, height: int) -> list[Forward]:
             f"ExtraNet, {native['width']}x{native['height']}", networks.extranet(), extranet, extranet[1].size
         ),
         forward(f"DLCTUS, {names['high']}", networks.dlctus_network(), (_shape(*high, 8),), sizes[1]),
-        forward(f"FASSET, {to_high}", networks.fasset(scale=2), fasset, sizes[1], method="render"),
+        forward(f"FASSET, {to_high}", networks.fasset(), fasset, sizes[1], method="render"),
         forward(f"IFRNet, {names['low']}", networks.ifrnet(), ifrnet, sizes[0], output="image"),
         forward(
             f"NSRR, {names['high']}", networks.nsrr(), features, sizes[1], method="reconstruct", given=features[1:]

@@ -93,10 +93,11 @@ def rows(options: Options) -> Iterator[Row]:
             continue
         variables = jax.jit(method.init)(jax.random.key(0), frames[0])
         for dtype in options.dtypes if count_parameters(variables) else ("float32",):
-            yield from _method_rows(name, bake(method, variables), frames, dtype, options)
+            yield from method_rows(name, bake(method, variables), frames, dtype, options)
 
 
-def _method_rows(name: str, method: Method, frames: list, dtype: str, options: Options) -> Iterator[Row]:
+def method_rows(name: str, method: Method, frames: list, dtype: str, options: Options) -> Iterator[Row]:
+    """Yield a row per kind of frame of a method with its weights built in."""
     kinds = (SS,) if method.info.renders_all else (SS, ESS)
     building, images = {}, stream(method, {}, map(jax.device_put, frames), kinds, dtype=dtype)
     jax.jit(method.start)(jax.device_put(frames[0]))

@@ -51,7 +51,7 @@ def cases(width: int, height: int) -> list[Case]:
         ("guided", gbuffer_guided_warp, (image, *guide_pair, motion)),
         ("occlusion motion", occlusion_motion, (motion, depth, hole)),
         ("dilated motion", dilate_motion, (motion, depth)),
-        ("motion at twice the size", partial(upsample_motion, scale=2), (motion,)),
+        ("motion at twice the size", partial(upsample_motion, size=(2 * height, 2 * width)), (motion,)),
         ("hole mask", hole_mask, (now.gbuffers, before.gbuffers, motion)),
         ("fill holes", fill_holes, (image, hole)),
         ("Gaussian resampling to twice the size", _resample, (image, now.jitter)),
@@ -60,7 +60,7 @@ def cases(width: int, height: int) -> list[Case]:
 
 
 def _resample(image, jitter):
-    return gaussian_resample(image, image, jitter, jnp.float32(0.65), 2)
+    return gaussian_resample(image, image, jitter, jnp.float32(0.65), (2 * image.shape[-3], 2 * image.shape[-2]))
 
 
 def rows(options: Options) -> Iterator[Row]:

@@ -276,8 +276,8 @@ def test_errors_name_the_file_and_what_to_do(dump, tmp_path):
             dump, tmp_path / "out", "blender", splits={"train": (8, 10), "validation": (11, 11), "test": (12, 14)}
         )
     meta = json.loads((dump / "meta.json").read_text())
-    (dump / "meta.json").write_text(json.dumps({**meta, "display_size": [50, 24]}))
-    with pytest.raises(ValueError, match=r"whole multiple of render_size, got 50x24 and 20x12"):
+    (dump / "meta.json").write_text(json.dumps({**meta, "display_size": [10, 24]}))
+    with pytest.raises(ValueError, match="expected display_size to be at least render_size, got 10x24 and 20x12"):
         run()
     for size in ([0, 0], [20.5, 12], [-20, 12]):
         (dump / "meta.json").write_text(json.dumps({**meta, "render_size": size}))
@@ -321,7 +321,7 @@ def quality_by_motion(sequence, t):
     jitters = {"jitter": now.jitter, "jitter_previous": before.jitter}
     valid = np.asarray(warp.hole_mask(now.gbuffers, before.gbuffers, now.motion, **jitters))
     surface = np.isfinite(now.gbuffers.depth)
-    upsampled = warp.upsample_motion(now.motion, 2, jitter=now.jitter)
+    upsampled = warp.upsample_motion(now.motion, sequence.size, jitter=now.jitter)
     result = {}
     for name, sign in {"right": (1, 1), "none": (0, 0), "y flipped": (1, -1), "x flipped": (-1, 1)}.items():
         moved = np.asarray(warp.backward_warp(sequence.reference[t - 1], upsampled * np.float32(sign)))

@@ -206,7 +206,7 @@ def test_calls_are_queued_between_two_looks_at_the_clock():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--suite", "warps"], "--suite: expected some of warp, networks, pipeline, train, scenes, got warps"),
+        (["--suite", "warps"], "--suite: expected some of warp, networks, pipeline, ratios, train, scenes, got warps"),
         (["--size", "960"], "--size 960: expected WIDTHxHEIGHT, at least 32x32 pixels"),
         (["--size", "16x16"], "--size 16x16: expected WIDTHxHEIGHT"),
         (["--repetitions", "0"], "expected at least 1 repetition and 2 frames, got 0 and 300"),
