@@ -13,6 +13,9 @@ from experiments.members import Member
 from experiments.settings import Settings
 from experiments.training import check_batches, check_crop
 
+SSIM_WINDOW = 11
+"""Pixels: frames that are smaller cannot be scored."""
+
 
 def check_settings(members: Sequence[Member]) -> None:
     """Refuse settings that the built-in scenes cannot be trained or scored with; nothing is rendered for it.
@@ -44,6 +47,12 @@ def check_dataset(members: Sequence[Member], dataset: Dataset) -> None:
       ValueError: a sequence has no frame that is scored, a variant needs buffers, a scale or frames that the data
         lacks, or no clip can be cut out of it.
     """
+    width, height = dataset.info.width, dataset.info.height
+    if min(width, height) < SSIM_WINDOW:
+        raise ValueError(
+            f"{dataset.path}: expected frames of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, the window of SSIM, got "
+            f"{width}x{height}."
+        )
     check_scored(dataset, members[0].settings)
     for member in members:
         reason = unfit(member.method.info, {"motion", *dataset.info.channels}, dataset.info.size, dataset.info.output)

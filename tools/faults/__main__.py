@@ -29,11 +29,12 @@ HEAD = """# Reliability
 Commands were killed, stopped, starved of disk, started twice and fed with damaged files, at random moments and in
 random places, and then run again to their end. *Lost*: the end differs from that of an undisturbed run.
 *Half-written*: a file under its final name is not whole. *Unclear*: a traceback, an exit code other than documented
-(0; 2 bad input or disk, 130 Ctrl-C, 143 SIGTERM), more than three lines, no file named, not heard within two
-seconds, or a hang.
+(0; 2 bad input or disk, 130 Ctrl-C, 143 SIGTERM), more than three lines, no file named, a signal not
+heard within two seconds (of the processor, on a busy machine), or a hang.
 
-Made by `{command}`, which goes on where it was stopped and takes hours; `tests/faults` holds a small version. The
-import is of six frames of 20x12, the scenes are of eight frames of 16x12 made before, the training has twelve steps.
+Made by `{command}`, which goes on where it was stopped and takes hours: *wanted* are its tries;
+`tests/faults` holds a small version. The import is of six frames of 20x12, the scenes are of eight frames of 16x12 that
+were made before, the training has twelve steps.
 """
 COLUMNS = "| kind | tries | wanted | lost | half-written | unclear |\n|---|--:|--:|--:|--:|--:|"
 

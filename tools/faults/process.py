@@ -69,6 +69,11 @@ class Child:
         self._began = time.monotonic()
         os.kill(self.pid, number)  # a process that was not waited for is still there
 
+    def cpu(self) -> float:
+        """Seconds of the processor that it has had."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def wait(self, most: float = HANG) -> Ended | None:
         """Wait for its end; None: it did not come in time."""
         deadline = time.monotonic() + most

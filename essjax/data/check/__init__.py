@@ -137,10 +137,13 @@ def check_dataset(
       progress: called with (frames done, frames in all).
 
     Raises:
-      ValueError: a file is missing or damaged, which the message names, or ``pairs`` is negative.
+      ValueError: a file is missing or damaged, which the message names, ``pairs`` is negative, or frames are lines.
     """
     if pairs < 0:
         raise ValueError(f"pairs: expected 0 (all frames) or more, got {pairs}.")
+    if min(dataset.info.width, dataset.info.height) < 2:
+        size = f"{dataset.info.width}x{dataset.info.height}"
+        raise ValueError(f"{dataset.path}: expected frames of at least 2x2 pixels, got {size}: a line proves nothing.")
     frames = sum(len(choose(info, pairs)) for info in dataset.sequences.values())
     checks: dict[str, _Checks] = {}
     done = 0
