@@ -19,7 +19,7 @@ from experiments.variants import Stage
 def batch_shapes(settings: Settings, stage: Stage) -> dict[str, Sequence]:
     """Return what ``make_batches`` gives of each task on the built-in scenes, as shapes; a small frame is rendered."""
     width, height = check_crop(stage.settings, *settings.data.size, settings.data.scale)
-    clip = Clip("train", "carousel", 0, frames=1, spp=1)
+    clip = Clip("train", "carousel", 0, frames=1, spp=settings.data.train_spp)  # the program that renders the data too
     one = live_source([clip], width, height, rendering=rendering_of(settings, ranges=stage.ranges))[0]
     leads = {name: batch_lead(stage, task, settings.data.train_frames) for name, task in stage.tasks.items()}
     clips = {name: lacking(task.without, one) for name, task in stage.tasks.items()}

@@ -1,12 +1,17 @@
 """Settings of the whole suite, and the fixtures that every test may use."""
 
+import gc
 import os
 import shutil
 import tempfile
 
-# Before JAX starts: the suite spends its time on compiling, and LLVM without optimisation compiles in two thirds of it.
-# XLA's own passes stay on. Set XLA_FLAGS (also to nothing) to test what users run; a test of speed must not rely on it.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+# Before JAX starts: the suite spends its time on compiling. LLVM without optimisation compiles in two thirds of it, and
+# without the emitters that set up an MLIR context for every fusion that halves again. XLA's own passes stay on. Set
+# XLA_FLAGS (also to nothing) to test what users run; a test of speed must not rely on it.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
+)
 # Without a GPU Triton kernels are tested in its interpreter; Triton reads this when it is imported.
 if shutil.which("nvidia-smi") is None:
     os.environ.setdefault("TRITON_INTERPRET", "1")
@@ -14,6 +19,12 @@ if shutil.which("nvidia-smi") is None:
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
+
+from essjax.scenes import render  # noqa: E402
+
+render.CPU_CHUNK = 4096  # images are small here: filling up a chunk of the usual size would cost more than they do
+PROGRAMS = 400
+"""A worker that holds more of them at the end of a file forgets all: they would stay until it ends, 7 GB of them."""
 
 hypothesis.settings.register_profile("default", deadline=None, max_examples=15, print_blob=True)
 hypothesis.settings.register_profile("ci", parent=hypothesis.settings.get_profile("default"), derandomize=True)
@@ -48,6 +59,15 @@ def compilation_cache():
     yield
     jax.config.update("jax_compilation_cache_dir", None)
     os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_memory():
+    """Forget compiled programs between files, before they are too many."""
+    yield
+    if len(jax.devices()[0].client.live_executables()) > PROGRAMS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

@@ -36,6 +36,7 @@ def finished(tmp_path_factory):
     overrides = [
         "data.test_frames=7",
         "data.train_frames=5",
+        "data.test_spp=4",
         "stages.steps=2",
         "data.size=[32,24]",
         "stages.crop=[32,24]",

@@ -53,11 +53,19 @@ def test_every_method_is_tested():
 
 @functools.cache
 def busy(name):
-    """Variables in which nothing is zero, so that all that a network sees reaches its output."""
-    variables = METHODS[name].init(jax.random.key(0), select_time(mixed([0] * T, [0]), 0))
-    leaves, structure = jax.tree.flatten(variables)
-    noise = [0.05 * random_image(n, *leaf.shape, low=-1.0, high=1.0) for n, leaf in enumerate(leaves)]
-    return variables if len(leaves) <= 2 else jax.tree.unflatten(structure, jax.tree.map(jnp.add, leaves, noise))
+    """Variables in which nothing is zero, so that all that a network sees reaches its output, without ``init``."""
+    frame = select_time(mixed([0] * T, [0]), 0)
+    shapes = jax.eval_shape(METHODS[name].init, jax.random.key(0), frame)
+    if len(jax.tree.leaves(shapes)) <= 2:  # settings, no network
+        return METHODS[name].init(jax.random.key(0), frame)
+    rng = np.random.default_rng(0)
+
+    def draw(path, leaf):
+        noise = rng.uniform(-1.0, 1.0, leaf.shape) * 2.0 / np.sqrt(np.prod(leaf.shape[:-1]))
+        around = {"kernel": 0.0, "bias": 0.0, "mean": 0.0}.get(path[-1].key, 1.0)
+        return jnp.asarray(around + (noise if path[-1].key == "kernel" else 0.05 * noise), jnp.float32)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 @functools.cache

@@ -149,11 +149,12 @@ def test_reference_converges():
     count = SIZE[0] * SIZE[1]
     group = render.chunk_size() // count  # samples per call, so that nothing recompiles
     total = np.zeros((count, 3))
-    for _ in range(8):
+    calls = 176 // group
+    for _ in range(calls):
         places = [render.screen_grid(*SIZE, rng.uniform(-0.5, 0.5, 2)) for _ in range(group)]
         x, y = (np.pad(np.concatenate(c), (0, render.chunk_size() - group * count)) for c in zip(*places, strict=True))
         color = np.asarray(render.color_along(world, x, y, angle))
-        total += color[: group * count].reshape(group, count, 3).mean(axis=0) / 8
+        total += color[: group * count].reshape(group, count, 3).mean(axis=0) / calls
     error = {}
     for spp in (1, 64):
         image = np.asarray(reinhard(render.render_reference(world, *SIZE, spp=spp))).reshape(count, 3)
@@ -165,7 +166,7 @@ def test_statistics_bound_the_reference_and_bumps_add_spread():
     scene = scenes.make_scene("texture", 1, 2)
     frame = scenes.render_frame(scene, 1, *SIZE, rendering=Rendering(scale=1, spp=16, ranges=True))
     stats, reference = frame.ranges, scene.unit * render.render_reference(scene.at(1), *SIZE, spp=16)
-    np.testing.assert_array_equal(frame.reference, reference)
+    np.testing.assert_allclose(frame.reference, reference, rtol=1e-5)  # two programs
     frames.validate_ranges(stats, 20, 36)
     assert (stats.color_min <= reference + 1e-4).all() and (reference <= stats.color_max + 1e-4).all()
     assert stats.normal_spread.shape == (20, 36, 1)
@@ -189,12 +190,11 @@ def test_motion_of_the_nearest_sample():
     assert behind.sum() > 5 and np.median(difference[behind]) > 0.1
 
 
-def gain(family, seed, index):
+def gain(family, seed, index, width=240, height=135, spp=9):
     """PSNR (after x / (1 + x)) of the reference warped from the frame before, over that of not moving it, decibels."""
     scene = scenes.make_scene(family, seed, index + 1)
-    width, height = 288, 162
-    before = render.render_reference(scene.at(index - 1), width, height, spp=16)
-    now = scenes.render_frame(scene, index, width, height, rendering=Rendering(scale=1, spp=16))
+    before = render.render_reference(scene.at(index - 1), width, height, spp=spp)
+    now = scenes.render_frame(scene, index, width, height, rendering=Rendering(scale=1, spp=spp))
     mask = now.valid * now.steady
     warped = np.asarray(warp.backward_warp(before, now.frames.motion))
     target = np.asarray(reinhard(now.reference * now.frames.exposure))
@@ -205,7 +205,7 @@ def gain(family, seed, index):
 
 MOVING = {
     "corridor": (0, 4), "carousel": (0, 4), "grille": (5, 4), "gloss": (5, 4), "shadows": (0, 4), "texture": (1, 4),
-    "plaza": (2, 4), "cuts": (1, 4), "rigging": (2, 4),
+    "cuts": (1, 4), "plaza": (2, 4, 288, 162, 16), "rigging": (2, 4, 288, 162, 16),  # slow, and thin
 }  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """The G-buffer guided warp against a brute-force NumPy oracle, and its properties."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,7 @@ from experiments.benchmark.measure import Compilations
 H, W, G = 13, 18, 6
 FEW = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**31 - 1)
-warp = jax.jit(gbuffer_guided_warp)
+warp = jax.jit(gbuffer_guided_warp, static_argnames="implementation")
 weights_of = jax.jit(guided_weights)
 SIGMAS = np.array([0.15, 0.15, 0.15, 0.14, 0.14, 0.14])
 
@@ -254,9 +256,7 @@ def test_extreme_guides_and_sigmas_stay_finite(sigma, size):
     radiance, guide_previous, guide, motion = scene(13)
     arguments = radiance, guide_previous * np.float32(size), guide * np.float32(size), motion
     network, sorting = (
-        jax.jit(
-            lambda *a, name=name: gbuffer_guided_warp(*a, sigma_guide=sigma, sigma_distance=sigma, implementation=name)
-        )(*arguments)
+        warp(*arguments, sigma_guide=sigma, sigma_distance=sigma, implementation=name)
         for name in ("network", "reference")
     )
     np.testing.assert_array_equal(network, sorting)
@@ -270,20 +270,19 @@ def test_motion_without_a_finite_number_leaves_the_border_pixel_rule():
     np.testing.assert_array_equal(got, np.broadcast_to(radiance[-1, -1], (H, W, 3)))
 
 
+@jax.jit
+@functools.partial(jax.grad, argnums=(0, 1))
+def gradients_of_square(sigma, arrays):
+    return jnp.sum(gbuffer_guided_warp(**arrays, sigma_guide=sigma) ** 2)
+
+
 @pytest.mark.parametrize("argument", ["guide", "guide_previous", "motion"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_gradients_are_finite_where_a_pixel_is_not(argument, value):
     """What matches nothing takes no part in the weights, nor in the gradients of all that does."""
     arrays = dict(zip(("radiance", "guide_previous", "guide", "motion"), map(np.array, scene(7)), strict=True))
     arrays[argument][4, 5] = value
-
-    @jax.jit
-    def gradients(sigma, arrays):
-        return jax.grad(lambda sigma, arrays: jnp.sum(gbuffer_guided_warp(**arrays, sigma_guide=sigma) ** 2), (0, 1))(
-            sigma, arrays
-        )
-
-    for leaf in jax.tree.leaves(gradients(0.3, arrays)):
+    for leaf in jax.tree.leaves(gradients_of_square(0.3, arrays)):
         assert np.isfinite(leaf).all()
 
 

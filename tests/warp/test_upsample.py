@@ -174,7 +174,8 @@ TAKE_JITTER = {
 @pytest.mark.parametrize("name", TAKE_JITTER)
 def test_jitter_is_two_numbers_in_any_container(name):
     function = TAKE_JITTER[name]
-    np.testing.assert_array_equal(function((0.1, -0.2)), function(jnp.array([0.1, -0.2])))
+    np.testing.assert_array_equal(jax.jit(function)((0.1, -0.2)), jax.jit(function)(jnp.array([0.1, -0.2])))
+    jax.eval_shape(lambda: function((0.1, -0.2)))  # also where they are numbers of Python
     for length in (1, 3):
         with pytest.raises(ValueError, match=rf"jitter: expected \[..., 2\] .x, y. in LR pixels, got \({length},\)"):
             function(jnp.zeros(length))
