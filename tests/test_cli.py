@@ -119,7 +119,7 @@ def test_a_dataset_grows_but_does_not_change(tmp_path, instant_renderer):
         generate(tmp_path, gloss, 10, 6)
     with pytest.raises(ValueError, match=r"made with ranges = False, asked for True\. Choose another output folder"):
         generate(tmp_path, gloss, 8, 6, rendering=Rendering(ranges=True))
-    with pytest.raises(ValueError, match="made with jitter = 'halton', asked for 'dlctus'"):
+    with pytest.raises(ValueError, match="made with jitter = 'kronecker', asked for 'dlctus'"):
         generate(tmp_path, gloss, 8, 6, rendering=Rendering(jitter="dlctus"))
     with pytest.raises(ValueError, match=r"other settings \(frames: asked 4, found 3\)"):
         generate(tmp_path, plan("train", 2, 4, families=["gloss"]), 8, 6)
