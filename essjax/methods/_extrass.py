@@ -187,8 +187,8 @@ def _prior(valid: Mask, weight: Array | float) -> Array:
     return jnp.log(share) - jnp.log(1.0 - share)  # never near 1: log1p would cost more and gain nothing
 
 
-SAMPLE_SIGMA = 0.65
-"""Standard deviation of the Gaussian that brings LR samples to the HR grid, HR pixels.
+SAMPLE_SIGMA = 0.325
+"""Standard deviation of the Gaussian that brings LR samples to the HR grid, LR pixels.
 
 This and the next four make the best untrained network on validation frames (experiments/LOG.md)."""
 SAMPLE_SHARE = 0.65
@@ -297,7 +297,8 @@ def extrass(
             extra = [log1p(extrapolated.warp), jnp.zeros_like(color) if base is None else base]
         assert color is not None
         encoded = log1p(color)
-        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, jnp.float32(SAMPLE_SIGMA), size)
+        sigma = jnp.float32(SAMPLE_SIGMA * math.sqrt(math.prod(ratios(frame_size(frame), size))))
+        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, sigma, size)
         motion, valid_low = history_motion(frame, size), trusted(frame, notes.gbuffers, notes.jitter)
         valid_low = jax.lax.stop_gradient(valid_low)
         low = [encoded, network_depth(frame.gbuffers, notes.depth_scale), valid_low, *extra]
