@@ -84,7 +84,7 @@ def _read(halves: Array, age: Array, offset: np.ndarray, size: tuple[int, int]) 
     places = jnp.clip(jnp.round(2.0 * (age[..., None] * jnp.asarray(offset) + REACH)), 0, 4 * REACH).astype(jnp.int32)
 
     def read(halves: Array, place: Array) -> Array:
-        start = (place[1] % 2, place[0] % 2, place[1] // 2, place[0] // 2, 0)
+        start = (place[1] % 2, place[0] % 2, place[1] // 2, place[0] // 2, jnp.int32(0))  # one type, with 64 bits too
         return jax.lax.dynamic_slice(halves, start, (1, 1, *size, channels))[0, 0]
 
     flat = halves.reshape(2, 2, -1, *halves.shape[-3:])
