@@ -104,7 +104,7 @@ DATA = {
     "data.read_sequence": {"frames"}, "exposure.exposed": {"map_radiance"}, "frames.check_dtypes": {"where"},
     "frames.check_shapes": {"where"}, "frames.validate_frame": {"where", "requires"},
     "frames.validate_ranges": {"where"}, "frames.validate_sequence": {"name", "requires"},
-    "networks.extrassnet": {"width"}, "networks.frnet": {"width"}, "rollout.alternate": {"phase"},
+    "rollout.alternate": {"phase"},
     "tensors.read_tensors": {"what"}, "train.predict_last": {"schedule"},
 }  # fmt: skip
 """Arguments with a default that may be given by position: what a function works on, not how."""

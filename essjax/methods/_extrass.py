@@ -4,7 +4,9 @@ Pipeline: extrapolation at low resolution (``extrass_low``, sections 4.2 and 4.3
 """
 
 import dataclasses
+import functools
 import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +22,7 @@ from essjax.frames import (
     network_depth,
     without_color,
 )
-from essjax.interfaces import Method, MethodInfo, Parted, Parts, from_parts, reset_at_cut
+from essjax.interfaces import Method, MethodInfo, Network, Parted, Parts, from_parts, reset_at_cut
 from essjax.methods.extrass_low import Extrapolated, extrapolate, frnet_inputs
 from essjax.methods.registry import registered
 from essjax.methods.rendered import (
@@ -37,7 +39,7 @@ from essjax.methods.shots import fade, upsampled_reactive, within_shots
 from essjax.networks import extrassnet, frnet
 from essjax.networks.blocks import crop, nearest_upsample, pad_to_multiple
 from essjax.sizes import Scale, Size, check_scale, output_size, ratios
-from essjax.typing import Array, Color, Flag, Image, Jitter, Mask, Motion, pytree
+from essjax.typing import Array, Callable, Color, Flag, Image, Jitter, Key, Mask, Motion, PyTree, pytree
 from essjax.warp import (
     Resampled,
     backward_warp,
@@ -199,6 +201,8 @@ HOLE_SHARE = 0.85
 """Share of either where it is not: most holes are narrow, and what is beside them is a fair guess."""
 CLAMP_LOGIT = 0.5
 """Logit of how far history is moved into the box of the current samples, before training."""
+CLAMP_LOGIT_BARE = -1.5
+"""Added to it without base colour, where extrapolated samples lack the texture that history has."""
 
 
 def _compose(head: Array, warped: Color, seen: Seen) -> Image:
@@ -210,12 +214,135 @@ def _compose(head: Array, warped: Color, seen: Seen) -> Image:
     current = seen.current
     output = crop(depth_to_space(head, 2), *current.color.shape[-3:-1])
     share = jax.nn.sigmoid(seen.prior + output[..., :1])
-    clamping = jax.nn.sigmoid(CLAMP_LOGIT + output[..., 1:2])
+    bare = seen.conditions[..., None, None, :1]
+    clamping = jax.nn.sigmoid(CLAMP_LOGIT + CLAMP_LOGIT_BARE * bare + output[..., 1:2])
     # One channel each: fused with the blend they would be computed for each of its three.
     share, clamping = jax.lax.optimization_barrier((share, clamping))
     clamped = ycocg_to_rgb(jnp.clip(rgb_to_ycocg(warped), current.low, current.high))
     history = warped + clamping * (clamped - warped)
     return history + share * (current.color - history) + output[..., 2:]
+
+
+class Settings(NamedTuple):
+    """All that the steps of ``extrass`` are made of.
+
+    Attributes:
+      flow_network: FRNet.
+      network: ExtraSSNet.
+      scale: see ``extrass``.
+      sigmas: of the guided warp, keyword arguments of ``guided_extrapolation``.
+    """
+
+    flow_network: Network
+    network: Network
+    scale: Scale
+    sigmas: dict[str, Any]
+
+
+def _start(settings: Settings, example: Frame) -> Parted:
+    past = Past(
+        rendered=start_pair(example),
+        gbuffers=jax.tree.map(jnp.copy, hole_buffers(example.gbuffers)),  # a streaming step donates its history
+        jitter=jnp.copy(example.jitter),
+        depth_scale=depth_scale(example.gbuffers),
+    )
+    size = output_size(settings.scale, frame_size(example))
+    return Parted(memory=past, shown=jnp.zeros((*example.motion.shape[:-3], *size, 3), jnp.float32))
+
+
+def _init(settings: Settings, key: Key, example: Frame) -> PyTree:
+    key_flow, key_net = jax.random.split(key)
+    flow = settings.flow_network.init(key_flow, *frnet_inputs(example))
+
+    def inputs(flow, frame):
+        history = _start(settings, frame)
+        seen = _observe(settings, {"frnet": flow}, _remember(history.memory, frame)[1], frame)
+        return _inputs(seen, history.shown), seen.conditions
+
+    rendered = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
+    kinds = [jax.eval_shape(inputs, flow, frame) for frame in (rendered, without_color(example))]
+    (ss, conditions), (ess, _) = kinds
+    return {"frnet": flow, "extrassnet": settings.network.init(key_net, ss, ess, conditions)}  # only shapes matter
+
+
+def _remember(past: Past, frame: Frame) -> tuple[Past, Notes]:
+    pair = advance(reset_pair(frame, past.rendered), frame)
+    unit = reset_at_cut(frame.cut, depth_scale(frame.gbuffers), past.depth_scale)
+    newest, older = (jax.tree.map(lambda leaf, k=k: leaf[k], pair.frames) for k in (0, 1))
+    notes = Notes(
+        rendered=(newest, older) if frame.color is None else None,
+        count=pair.count,
+        gbuffers=past.gbuffers,
+        jitter=past.jitter,
+        depth_scale=unit,
+    )
+    past = Past(
+        rendered=pair if frame.color is None else push_pair(pair, frame),
+        gbuffers=hole_buffers(frame.gbuffers),
+        jitter=frame.jitter,
+        depth_scale=unit,
+    )
+    return past, notes
+
+
+def _observe(settings: Settings, variables: PyTree, notes: Notes, frame: Frame) -> Seen:
+    color, extrapolated, extra = frame.color, None, []
+    size = output_size(settings.scale, frame_size(frame))
+    if notes.rendered is not None:
+        flow = settings.flow_network, variables["frnet"]
+        pair = jax.tree.map(lambda *frames: jnp.stack(frames), *notes.rendered)
+        extrapolated = extrapolate(*flow, pair, notes.count, frame, settings.sigmas)
+        base = frame.gbuffers.base_color
+        color = extrapolated.image
+        extra = [log1p(extrapolated.warp), jnp.zeros_like(color) if base is None else base]
+    assert color is not None
+    encoded = log1p(color)
+    sigma = jnp.float32(SAMPLE_SIGMA * math.sqrt(math.prod(ratios(frame_size(frame), size))))
+    current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, sigma, size)
+    motion, valid_low = history_motion(frame, size), trusted(frame, notes.gbuffers, notes.jitter)
+    valid_low = jax.lax.stop_gradient(valid_low)
+    low = [encoded, network_depth(frame.gbuffers, notes.depth_scale), valid_low, *extra]
+    low = [to_half_grid(image, size, frame.jitter) for image in low]
+    valid = crop(nearest_upsample(low[2]), *size) * inside_mask(motion)
+    weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98) if extrapolated is None else EXTRAPOLATED_SHARE
+    low.insert(3, half_grid_offset(frame_size(frame), size, frame.jitter))
+    return Seen(
+        cut=frame.cut,
+        reactive=upsampled_reactive(frame, size),
+        motion=motion,
+        valid=valid,
+        valid_low=valid_low,
+        low=jnp.concatenate(low, axis=-1),
+        current=current,
+        prior=_prior(valid, weight),
+        conditions=conditions_of(frame, None if notes.rendered is None else notes.rendered[0].age, size),
+        extrapolated=extrapolated,
+    )
+
+
+def _inputs(seen: Seen, warped: Color) -> Image:
+    high = [space_to_depth(pad_to_multiple(image, 2), 2) for image in (seen.current.color, warped)]
+    return jnp.concatenate([*high, seen.low], axis=-1)
+
+
+def _show(settings: Settings, variables: PyTree, image: Color, seen: Seen, *, train: bool) -> tuple[Color, Prediction]:
+    # Before the network sees it: what is reactive may not reach the output at all.
+    log_warped = fade(warp_shown(image, seen.motion), seen.current.color, seen.reactive, seen.cut)
+    encode = "render" if seen.extrapolated is None else "extrapolate"
+    inputs = _inputs(seen, log_warped)
+    given = inputs, seen.conditions
+    (head, features), _ = settings.network.apply(variables["extrassnet"], *given, train=train, method=encode)
+    log_image = _compose(head, log_warped, seen)
+    warped = Warped(log_image=log_warped, valid=seen.valid, valid_low=seen.valid_low)
+    aux = {"log_image": log_image, "warped": warped, "features": features}
+    if seen.extrapolated is not None:
+        aux["extrapolated"] = seen.extrapolated
+    image = expm1(log_image)
+    return image, Prediction(image=image, aux=aux)
+
+
+def _map_memory(function: Callable[[Array], Array], past: Past) -> Past:
+    return dataclasses.replace(past, rendered=map_shading(function, past.rendered))
 
 
 @registered
@@ -240,107 +367,13 @@ def extrass(
       sigma_guide: see ``extrass_w``.
       sigma_distance: see ``extrass_w``.
     """
-    flow_network, network, scale = frnet(frnet_width), extrassnet(width), check_scale(scale)
-    sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
-
-    def start(example: Frame) -> Parted:
-        past = Past(
-            rendered=start_pair(example),
-            gbuffers=jax.tree.map(jnp.copy, hole_buffers(example.gbuffers)),  # a streaming step donates its history
-            jitter=jnp.copy(example.jitter),
-            depth_scale=depth_scale(example.gbuffers),
-        )
-        image = jnp.zeros((*example.motion.shape[:-3], *output_size(scale, frame_size(example)), 3), jnp.float32)
-        return Parted(memory=past, shown=image)
-
-    def init(key, example):
-        key_flow, key_net = jax.random.split(key)
-        flow = flow_network.init(key_flow, *frnet_inputs(example))
-
-        def inputs(flow, frame):
-            history = start(frame)
-            seen = observe({"frnet": flow}, remember(history.memory, frame)[1], frame)
-            return _inputs(seen, history.shown), seen.conditions
-
-        rendered = dataclasses.replace(example, color=jnp.zeros((*example.motion.shape[:-1], 3), jnp.float32))
-        kinds = [jax.eval_shape(inputs, flow, frame) for frame in (rendered, without_color(example))]
-        (ss, conditions), (ess, _) = kinds
-        return {"frnet": flow, "extrassnet": network.init(key_net, ss, ess, conditions)}  # only shapes matter
-
-    def remember(past: Past, frame: Frame) -> tuple[Past, Notes]:
-        pair = advance(reset_pair(frame, past.rendered), frame)
-        unit = reset_at_cut(frame.cut, depth_scale(frame.gbuffers), past.depth_scale)
-        newest, older = (jax.tree.map(lambda leaf, k=k: leaf[k], pair.frames) for k in (0, 1))
-        notes = Notes(
-            rendered=(newest, older) if frame.color is None else None,
-            count=pair.count,
-            gbuffers=past.gbuffers,
-            jitter=past.jitter,
-            depth_scale=unit,
-        )
-        past = Past(
-            rendered=pair if frame.color is None else push_pair(pair, frame),
-            gbuffers=hole_buffers(frame.gbuffers),
-            jitter=frame.jitter,
-            depth_scale=unit,
-        )
-        return past, notes
-
-    def observe(variables, notes: Notes, frame: Frame) -> Seen:
-        color, extrapolated, extra = frame.color, None, []
-        size = output_size(scale, frame_size(frame))
-        if notes.rendered is not None:
-            pair = jax.tree.map(lambda *frames: jnp.stack(frames), *notes.rendered)
-            extrapolated = extrapolate(flow_network, variables["frnet"], pair, notes.count, frame, sigmas)
-            base = frame.gbuffers.base_color
-            color = extrapolated.image
-            extra = [log1p(extrapolated.warp), jnp.zeros_like(color) if base is None else base]
-        assert color is not None
-        encoded = log1p(color)
-        sigma = jnp.float32(SAMPLE_SIGMA * math.sqrt(math.prod(ratios(frame_size(frame), size))))
-        current = gaussian_resample(encoded, rgb_to_ycocg(encoded), frame.jitter, sigma, size)
-        motion, valid_low = history_motion(frame, size), trusted(frame, notes.gbuffers, notes.jitter)
-        valid_low = jax.lax.stop_gradient(valid_low)
-        low = [encoded, network_depth(frame.gbuffers, notes.depth_scale), valid_low, *extra]
-        low = [to_half_grid(image, size, frame.jitter) for image in low]
-        valid = crop(nearest_upsample(low[2]), *size) * inside_mask(motion)
-        weight = jnp.clip(SAMPLE_SHARE * current.weight, 0.02, 0.98) if extrapolated is None else EXTRAPOLATED_SHARE
-        low.insert(3, half_grid_offset(frame_size(frame), size, frame.jitter))
-        return Seen(
-            cut=frame.cut,
-            reactive=upsampled_reactive(frame, size),
-            motion=motion,
-            valid=valid,
-            valid_low=valid_low,
-            low=jnp.concatenate(low, axis=-1),
-            current=current,
-            prior=_prior(valid, weight),
-            conditions=conditions_of(frame, None if notes.rendered is None else notes.rendered[0].age, size),
-            extrapolated=extrapolated,
-        )
-
-    def _inputs(seen: Seen, warped: Color) -> Image:
-        high = [space_to_depth(pad_to_multiple(image, 2), 2) for image in (seen.current.color, warped)]
-        return jnp.concatenate([*high, seen.low], axis=-1)
-
-    def show(variables, image: Color, seen: Seen, *, train: bool):
-        # Before the network sees it: what is reactive may not reach the output at all.
-        log_warped = fade(warp_shown(image, seen.motion), seen.current.color, seen.reactive, seen.cut)
-        encode = "render" if seen.extrapolated is None else "extrapolate"
-        inputs = _inputs(seen, log_warped)
-        given = inputs, seen.conditions
-        (head, features), _ = network.apply(variables["extrassnet"], *given, train=train, method=encode)
-        log_image = _compose(head, log_warped, seen)
-        warped = Warped(log_image=log_warped, valid=seen.valid, valid_low=seen.valid_low)
-        aux = {"log_image": log_image, "warped": warped, "features": features}
-        if seen.extrapolated is not None:
-            aux["extrapolated"] = seen.extrapolated
-        image = expm1(log_image)
-        return image, Prediction(image=image, aux=aux)
-
-    def map_memory(function, past: Past) -> Past:
-        return dataclasses.replace(past, rendered=map_shading(function, past.rendered))
-
-    info = MethodInfo("extrass", scale=scale)
-    method = from_parts(init, start, Parts(remember, observe, show), info)
-    return within_shots(exposed_parts(method, map_memory, lambda function, image: function(image)))
+    settings = Settings(
+        flow_network=frnet(width=frnet_width),
+        network=extrassnet(width=width),
+        scale=check_scale(scale),
+        sigmas={"sigma_guide": sigma_guide, "sigma_distance": sigma_distance},
+    )
+    parts = Parts(_remember, functools.partial(_observe, settings), functools.partial(_show, settings))
+    start, init = (functools.partial(function, settings) for function in (_start, _init))
+    method = from_parts(init, start, parts, MethodInfo("extrass", scale=settings.scale))
+    return within_shots(exposed_parts(method, _map_memory, lambda function, image: function(image)))

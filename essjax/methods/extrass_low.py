@@ -175,7 +175,7 @@ def extrass_e(
       sigma_guide: see ``extrass_w``.
       sigma_distance: see ``extrass_w``.
     """
-    network = frnet(width)
+    network = frnet(width=width)
     sigmas = {"sigma_guide": sigma_guide, "sigma_distance": sigma_distance}
 
     def init(key, example):

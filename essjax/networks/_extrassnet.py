@@ -101,6 +101,6 @@ class ExtraSSNet(nn.Module):
         return self.render(inputs_ss, conditions), self.extrapolate(inputs_ess, conditions)
 
 
-def extrassnet(width: int = 24) -> Network:
+def extrassnet(*, width: int = 24) -> Network:
     """ExtraSSNet as a ``Network``; choose the path with ``apply(..., method="render" | "extrapolate")``."""
     return from_linen(ExtraSSNet(width))

@@ -173,6 +173,6 @@ class FRNet(nn.Module):
         }
 
 
-def frnet(width: int = 16) -> Network:
+def frnet(*, width: int = 16) -> Network:
     """FRNet as a ``Network``; ``apply(..., method="encode")`` gives the encoder's features of an image."""
     return from_linen(FRNet(width))

@@ -124,7 +124,7 @@ def test_blend_mask_equals_numpy():
 
 
 def test_untrained_refinement_keeps_the_warp_of_rough_surfaces():
-    network = frnet(4)
+    network = frnet(width=4)
     frames = random_frames()
     frames = dataclasses.replace(frames, gbuffers=dataclasses.replace(frames.gbuffers, roughness=None))  # counts as 1
     warped = 1.0 + random_image(5, 2, B, H, W, 3, high=0.1)

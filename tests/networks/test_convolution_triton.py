@@ -75,7 +75,7 @@ def test_its_derivative_is_the_ordinary_ones(monkeypatch):
 
 def test_a_network_is_the_same_by_it(monkeypatch):
     """ExtraSSNet in float16: 31 input channels, odd sizes; in float32 the kernel is not used."""
-    network, x = extrassnet(16), np.random.default_rng(1).normal(size=(1, 13, 18, 31)).astype(np.float32)
+    network, x = extrassnet(width=16), np.random.default_rng(1).normal(size=(1, 13, 18, 31)).astype(np.float32)
     variables = network.init(jax.random.key(0), x, np.zeros((1, 13, 18, 37), np.float32), NONE)
     noise = np.random.default_rng(2)
     variables = jax.tree.map(lambda v: v + 0.05 * noise.standard_normal(v.shape, np.float32), variables)
@@ -98,7 +98,7 @@ def test_a_network_is_the_same_by_it(monkeypatch):
 
 def test_its_products_are_counted_as_ever(monkeypatch):
     """On a GPU too: neither hidden in the kernel nor with the channels that are padded."""
-    network, x = extrassnet(16), jax.ShapeDtypeStruct((1, 16, 24, 31), jnp.float32)
+    network, x = extrassnet(width=16), jax.ShapeDtypeStruct((1, 16, 24, 31), jnp.float32)
     shapes = jnp.zeros(x.shape), jnp.zeros((1, 16, 24, 37)), NONE
     variables = jax.eval_shape(lambda: network.init(jax.random.key(0), *shapes))
 

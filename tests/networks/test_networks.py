@@ -79,7 +79,7 @@ def randomised(variables, seed=3):
 
 @pytest.fixture(scope="module")
 def small_frnet():
-    network = frnet(4)
+    network = frnet(width=4)
     return network, network.init(
         jax.random.key(0), jnp.zeros((2, 1, 8, 8, 3)), jnp.zeros((1, 8, 8, 1)), jnp.ones((2, 1))
     )
@@ -135,7 +135,7 @@ def test_matching_of_equal_frames_finds_no_motion():
 
 
 def test_extrassnet_on_odd_sizes():
-    network = extrassnet(4)
+    network = extrassnet(width=4)
     ss, ess = random_image(0, 2, 9, 13, 5), random_image(1, 2, 9, 13, 7)
     conditions = random_image(2, 2, CONDITIONS)
     variables = network.init(jax.random.key(0), ss, ess, conditions)
@@ -159,7 +159,7 @@ def test_extrassnet_on_odd_sizes():
 
 
 def test_initial_kernels_have_he_variance_and_depend_on_the_key():
-    network = extrassnet(24)
+    network = extrassnet(width=24)
     shapes = (1, 8, 8, 31), (1, 8, 8, 37), (1, CONDITIONS)
     inputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     first, second = (network.init(jax.random.key(seed), *inputs)["params"] for seed in (0, 1))
