@@ -1,5 +1,6 @@
 """The table that the terminal and the page share: which rows, in which order, what is best."""
 
+import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -139,7 +140,7 @@ def make_table(
 
 
 class RateTable(NamedTuple):
-    """PSNR by rate and distance to the rendered frame: heads of the columns, method -> its cells."""
+    """PSNR by distance to the rendered frame at one rate: heads of the columns, method -> its cells."""
 
     title: str
     heads: list[str]
@@ -147,29 +148,32 @@ class RateTable(NamedTuple):
 
 
 def rate_tables(metrics: Mapping[str, Any]) -> list[RateTable]:
-    """Make a table of each resolution; none where frames were rendered at 1:2 alone, for that the others show."""
+    """Make a table of each resolution and rate; none where frames were rendered at 1:2 alone, for the others show that.
+
+    Methods come in the order of their farthest frames.
+    """
     rows = metrics.get("rates") or []
-    if {row["rate"] for row in rows} <= {2}:
+    rates = sorted({row["rate"] for row in rows})
+    if rates in ([], [2]):
         return []
     tables = []
-    for resolution in resolutions({"rows": rows}):
+    for resolution, rate in itertools.product(resolutions({"rows": rows}), rates):
         found = {
-            (row["method"], row["rate"], row["distance"]): row["psnr"]
+            (row["method"], row["distance"]): row["psnr"]
             for row in rows
-            if row["resolution"] == resolution and row.get("psnr") is not None
+            if (row["resolution"], row["rate"]) == (resolution, rate) and row.get("psnr") is not None
         }
-        places = sorted({key[1:] for key in found})
-        methods = dict.fromkeys(key[0] for key in found)
-        tables.append(
-            RateTable(
-                f"PSNR (dB) by rate and frames since the rendered one, {resolution.upper()}",
-                [f"1:{rate} {f'+{distance}' if distance else 'SS'}" for rate, distance in places],
-                {
-                    method: [f"{found[method, *place]:.2f}" if (method, *place) in found else "–" for place in places]
-                    for method in methods
-                },
-            )
+        distances = sorted({distance for _, distance in found})
+        methods = sorted(
+            dict.fromkeys(method for method, _ in found),
+            key=lambda method: [-found.get((method, distance), 0.0) for distance in reversed(distances)],
         )
+        lines = {
+            method: [f"{found[method, d]:.2f}" if (method, d) in found else "–" for d in distances]
+            for method in methods
+        }
+        title = f"One frame in {rate} rendered, {resolution.upper()}: PSNR (dB) by frames since the rendered one"
+        tables.append(RateTable(title, [f"+{distance}" if distance else "SS" for distance in distances], lines))
     return tables
 
 

@@ -45,7 +45,7 @@ def print_table(
         grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False)
         grid.add_column("method", no_wrap=True)
         for head in rates.heads:
-            grid.add_column(head.replace(" ", "\n"), justify="right", no_wrap=True)
+            grid.add_column(head, justify="right", no_wrap=True)
         for method, cells in rates.lines.items():
             grid.add_row(method, *cells)
         console.print(rates.title, style="bold", highlight=False)

@@ -20,12 +20,14 @@ RATES = [
 
 def test_a_table_by_distance_where_there_is_more_than_every_other_frame(tmp_path):
     metrics = {**make_metrics(), "rates": RATES}
-    (table,) = rate_tables(metrics)
-    assert table.heads == ["1:2 SS", "1:2 +1", "1:3 SS", "1:3 +1", "1:3 +2"]
-    assert table.lines["extrass"] == ["26.25", "25.25", "26.25", "25.25", "24.25"]
-    console = Console(file=io.StringIO(), width=100)
+    half, third = rate_tables(metrics)
+    assert half.heads == ["SS", "+1"] and third.heads == ["SS", "+1", "+2"]
+    assert list(third.lines) == ["extrass", "taau-half"]  # the best first
+    assert third.lines["extrass"] == ["26.25", "25.25", "24.25"]
+    console = Console(file=io.StringIO(), width=80)
     print_table(metrics, console=console)
-    assert "PSNR (dB) by rate and frames since the rendered one, HR" in console.file.getvalue()
+    text = console.file.getvalue()
+    assert "One frame in 3 rendered, HR: PSNR (dB) by frames since the rendered one" in text and "…" not in text
     assert "<td>24.25</td>" in write_report(tmp_path, metrics).read_text()
     assert rate_tables(make_metrics()) == []
     assert rate_tables({**metrics, "rates": [row for row in RATES if row["rate"] == 2]}) == []
