@@ -25,6 +25,7 @@ def flat(*last, dtype=jnp.float32):
 
 
 IMAGE, PLANE, COLOR, FIELD, GUIDE = array(4), array(1), array(3), array(2), array(6)
+SIZE = (LARGE["height"], LARGE["width"])
 LARGE_FIELD, JITTER, CLASSES = array(2, **LARGE), flat(2), array(1, dtype=jnp.int32)
 BOTH = {"jitter": JITTER, "jitter_previous": JITTER}
 GBUFFERS = GBuffers(depth=PLANE, normal=COLOR, world_position=COLOR)
@@ -52,25 +53,27 @@ CALLS = {
     metrics.warped_error: (IMAGE, IMAGE, FIELD, {"valid": PLANE}),
     warp.backward_warp: (IMAGE, FIELD), warp.compose_motion: (FIELD, FIELD, BOTH),
     warp.depth_to_space: (IMAGE, {"block": 2}), warp.dilate_motion: (IMAGE, PLANE), warp.fill_holes: (IMAGE, PLANE),
-    warp.gaussian_resample: (IMAGE, COLOR, JITTER, jax.ShapeDtypeStruct((), jnp.float32), {"scale": 2}),
+    warp.gaussian_resample: (IMAGE, COLOR, JITTER, jax.ShapeDtypeStruct((), jnp.float32), {"size": SIZE}),
     warp.gbuffer_guided_warp: (COLOR, GUIDE, GUIDE, FIELD), warp.guided_weights: (GUIDE, GUIDE, FIELD),
     warp.guides: (GBuffers(depth=PLANE, base_color=COLOR, normal=COLOR),),
     warp.hole_mask: (GBUFFERS, GBUFFERS, FIELD, BOTH), warp.inside_mask: (FIELD,),
     warp.depth_guide: (PLANE,), warp.normals_from_depth: (PLANE,),
-    warp.jitter_aligned_upsample: (IMAGE, {"scale": 1.5}, JITTER),
+    warp.jitter_aligned_upsample: (IMAGE, {"size": SIZE}, JITTER),
     warp.jittered_motion: (FIELD, JITTER, JITTER), warp.occlusion_motion: (FIELD, PLANE, PLANE),
     warp.sample: (IMAGE, LARGE_FIELD), warp.sample_by_fetches: (IMAGE, LARGE_FIELD),
-    warp.sample_zero_upsampled: (IMAGE, LARGE_FIELD, {"scale": 2}, JITTER),
+    warp.sample_zero_upsampled: (IMAGE, LARGE_FIELD, {"size": SIZE}, JITTER),
     warp.space_to_depth: (array(4, **LARGE), {"block": 2}), warp.splat: (IMAGE, FIELD),
     warp.splat_motion: (IMAGE, PLANE, FIELD), warp.splat_nearest: (IMAGE, PLANE, FIELD),
-    warp.tent_resample: (IMAGE, COLOR, JITTER, {"scale": 2}), warp.upsample_motion: (FIELD, {"scale": 2}),
-    warp.zero_upsample: (IMAGE, {"scale": 2}, JITTER),
+    warp.tent_resample: (IMAGE, COLOR, JITTER, {"size": SIZE}), warp.upsample_motion: (FIELD, {"size": SIZE}),
+    warp.to_half_grid: (IMAGE, {"size": SIZE}, JITTER), warp.half_grid_offset: ({"low": (6, 8), "size": SIZE}, JITTER),
+    warp.nearest_upsample: (IMAGE, {"size": SIZE}), warp.zero_upsample: (IMAGE, {"size": SIZE}, JITTER),
 }  # fmt: skip
 """Function -> its arguments: arrays in order, others by name."""
 WITHOUT_ARRAYS = {
     "aggregate",
     "candidate_offsets",
     "distances",
+    "half_size",
     "has_source",
     "mean_over",
     "score_rollout",

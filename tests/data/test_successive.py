@@ -93,7 +93,7 @@ def test_from_disk_the_clips_are_those_from_memory(tmp_path):
 
 
 def test_what_cannot_be_cut_is_refused():
-    with pytest.raises(ValueError, match="expected length >= 2 and batch >= 1, got 1 and 2"):
+    with pytest.raises(ValueError, match=r"expected length > 1 \(the overlap\) and batch >= 1, got 1 and 2"):
         successive_clips([coordinates(0)], length=1, batch=2)
     with pytest.raises(ValueError, match=r"no 6 consecutive frames .* in 1 sequences \(the longest shot has 5 frames"):
         successive_clips([coordinates(0, cuts=(0, 4))], length=6, batch=1)

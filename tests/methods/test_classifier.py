@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from essjax.color import display, reinhard, rgb_to_ycocg, ycocg_to_rgb
-from essjax.frames import GBuffers, select_time, without_color
+from essjax.frames import GBuffers, frame_size, select_time, without_color
 from essjax.methods import classifier, jau
 from essjax.methods._classifier import (
     RANGE_RATE,
@@ -55,7 +55,7 @@ def rollout():
 step = jax.jit(METHOD.render_step, compiler_options=FAST)
 
 
-see = jax.jit(lambda frame, unit: look(frame, unit, 2, 0.8))
+see = jax.jit(lambda frame, unit: look(frame, unit, tuple(2 * side for side in frame_size(frame)), 0.8))
 
 
 @pytest.fixture(scope="module")

@@ -62,7 +62,7 @@ def test_previous_frames_are_read_along_their_paths(busy):
     motion = jnp.broadcast_to(jnp.asarray(steps[:, None, None, None], jnp.float32), frames.motion.shape)
     frames = dataclasses.replace(frames, motion=motion)
     history, last = rollout()(busy, select_time(frames, slice(0, T))).history, select_time(frames, T)
-    look_back = jax.jit(lambda memory, frame: warp_previous(advance(memory, frame), frame, 2))
+    look_back = jax.jit(lambda memory, frame: warp_previous(advance(memory, frame), frame, (2 * H, 2 * W)))
     got = np.asarray(look_back(history.rendered, last))
     color, jitter = np.asarray(display(frames.color)), np.asarray(frames.jitter)
     y, x = np.mgrid[: 2 * H, : 2 * W]

@@ -58,7 +58,7 @@ def test_a_network_stays_close_to_float32(dtype):
 
 
 def test_pixelwise_layers_follow():
-    network = fasset(scale=1.5, width=8, hidden=8)
+    network = fasset(width=8, hidden=8)
     shapes = [*((1, 8, 12, n) for n in (3, 1, 7, PAST, 8)), (1, 12, 18, LOCAL), (1, 2)]
     inputs = _random([jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes])
     variables = network.init(jax.random.key(3), *inputs)
