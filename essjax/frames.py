@@ -173,7 +173,7 @@ def surface_guides(gbuffers: GBuffers) -> tuple[Color, Vectors]:
     """Return base colour and normal; a ValueError says which one is missing."""
     if gbuffers.base_color is None or gbuffers.normal is None:
         missing = [name for name in ("base_color", "normal") if getattr(gbuffers, name) is None]
-        raise ValueError(f"guided warps need the buffers {', '.join(missing)}, which these frames do not have.")
+        raise ValueError(f"expected frames with base colour and normals, got some without {', '.join(missing)}.")
     return gbuffers.base_color, gbuffers.normal
 
 

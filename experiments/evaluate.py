@@ -278,11 +278,11 @@ def evaluate(
         for rate in rates:
             for schedule in schedules(runner.method, rate) if runs_at(runner.method, rate, rates[0]) else ():
                 kinds = schedule.kinds(len(clip.numbers))
-                images = runner(clip.sequence, schedule)
+                ages, images = distances(kinds), runner(clip.sequence, schedule)
                 every_rate[name][clip.name] += score_clip(runner.method, clip, images, kinds, rate)
                 for n in picture_frames(clip, pictures) if rate == rates[0] else ():
                     with lock:
-                        if has_image(clip, n, runner.method, kinds) and distances(kinds)[n] in (0, rate - 1):
+                        if has_image(clip, n, runner.method, kinds) and ages[n] in (0, rate - 1):
                             _collect_picture(shown, clip, n, name, runner.method, images, kinds, rate)
 
     lock = threading.Lock()
